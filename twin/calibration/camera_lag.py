@@ -97,13 +97,13 @@ def lag_of(
 
 
 def without_lag(frames: Frames, plan: Windows, lag: Lag) -> Float32Array:
-    """Remove the lag of the frame before from the windows of every frame.
+    """Remove the lag of the two frames before from windows round the beads of every
+    frame.
 
-    The lag in the two frames before is removed first. Pixels for which no frame before has a
-    value stay as they are; at least `LEAST_LIGHT` of the open beam is left.
-    `frames`: of the scan, in the order in which they were taken; `plan`: windows round the beads
-    of each frame; `lag`: of the camera.
-    Returns line integrals (n, k, side, side), nan where a frame has no image."""
+    Pixels without a value in a frame before stay as they are; `LEAST_LIGHT` of the open
+    beam or more is left. `frames`: of the scan, in the order taken. Returns line
+    integrals (n, k, side, side), nan where a frame has no image.
+    """
     light = np.full((*plan.corner.shape[:2], plan.side, plan.side), np.nan)
     for back in (2, 1, 0):
         shown = np.exp(-np.roll(frames.windows(_rolled(plan, -back)), back, axis=0))
@@ -137,15 +137,11 @@ def _near(
 
 
 def _products(light: Float32Array, shadow: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Sum products over each bead's windows, less a paraboloid each: of its shadow in
-    another frame with the image at that place, and of the shadow with itself.
+    """Sum products over windows, less a paraboloid each: shadow times image, shadow
+    squared.
 
-    Args:
-        light: (n, k, side, side) the image, nan where unusable.
-        shadow: likewise, of the other frame; only pixels finite in both count.
-
-    Returns:
-        (k,) each; 0 for a bead without pixels.
+    Both are (n, k, side, side); pixels finite in both count. Returns (k,) each, 0 without
+    any.
     """
     use = np.isfinite(light) & np.isfinite(shadow)
     one, other = (_bent(values, use) for values in (shadow, light))

@@ -59,10 +59,10 @@ def fit_with_loose_priors(
 
 
 def _beads_explain_more(freed: FitResult, loose: FitResult) -> bool:
-    """Check whether the places of beads explain residuals better than loose priors, by the
-    likelihood less the price of their columns (Schwarz, Annals of Statistics 6 (1978) 461).
-    `freed`: the fit with free beads; `loose`: the fit with loose priors, the beads at their
-    stated places."""
+    """Check whether free beads explain residuals better than loose priors.
+
+    Their columns have a price (Schwarz, Annals of Statistics 6 (1978) 461).
+    """
     count = 2 * int(loose.certificate.used.sum())
     columns = 3 * len(freed.problem.model)
     gain = count * math.log(loose.certificate.rms_px / freed.certificate.rms_px)
@@ -171,15 +171,12 @@ def refit_scans(
     arc: bool | None = None,
     rows: bool | None = None,
 ) -> FitResult:
-    """Fit again with more parameters free, or with causes of the residuals; see `fit_scans`.
+    """Fit again with more parameters free, or with causes of the residuals; see
+    `fit_scans`.
 
-    `state`: the scans and their measurements; not changed. `request`: the parameters free
-    otherwise. `fit`: the last one, whose distortion, strain, arc and rows are kept. `extra`:
-    parameters that are free too. `bead_tolerance_mm`: prior of the beads' places; None: the
-    request's, not the last fit's. `start`: offsets of each scan; None: those of the last fit.
-    `panel`: distortion to estimate; None: the last fit's. `strain`: prior of the phantom's
-    strains; None: the last fit's. `arc`: whether an exposure lasts a part of the step; None: as
-    in the last fit. `rows`: whether rows are read one after another; None: as in the last fit.
+    `extra` parameters are free besides the request's. None is the last fit's `start` (one
+    each scan), `panel`, `strain`, `arc` (of an exposure) and `rows` (read one after
+    another); for `bead_tolerance_mm` it is the request's, not the last fit's.
     """
     begin = fit.group_parameters if start is None else start
     freed = replace(request, free=tuple(dict.fromkeys((*request.free, *extra))))

@@ -231,17 +231,10 @@ def _exact_judged(
     fit: FitResult,
     exact: Mapping[str, float],
 ) -> Finding | None:
-    """Judge the parameters stated as exact by a fit with their usual priors.
+    """Judge the `exact` parameters (edge units) by a fit with their usual priors.
 
-    An error only stands with the sigmas of causes left open, of positions with all that moves:
-    of what was taken out with the parameters held, a part is theirs.
-
-    Args:
-        whole: the scans and their measurements.
-        state: the same without what moves.
-        usual: the request with usual priors.
-        fit: with the exact values.
-        exact: parameter -> value, edge units.
+    An error must stand on the `whole` data with all causes, too; `state` is without what
+    moves.
     """
     judged = judge_exact(fit, refit_scans(state, usual, fit), exact)
     if judged is not None and judged.forbids:
@@ -269,14 +262,10 @@ def _contradicted(
     fixed: Mapping[str, float],
     free: tuple[FitResult, list[Finding]],
 ) -> list[Finding] | None:
-    """Judge whether the data contradict fixed parameters.
+    """Judge whether the data contradict parameters that are `fixed` (edge units).
 
-    The free fit is judged if it has all of them; else a fit for each, with that one free.
-
-    `state`: the scans and their measurements. `asked`: the user's request. `fit`: its fit.
-    `fixed`: main parameters that it fixes, edge units; may be empty. `free`: the fit with more
-    parameters free, and the findings on its residuals.
-    Returns findings on the residuals and on the first contradiction; None if there is none.
+    The `free` fit is judged if it has all of them; else one fit each, with it free.
+    Returns findings on its residuals and the first contradiction; None without.
     """
     trials = [free]
     if not set(fixed) <= set(free[0].values):
@@ -316,12 +305,12 @@ def _left_by_priors(
     loose_fit: FitResult,
     explained: Sequence[Finding],
 ) -> list[Finding]:
-    """Return the findings on residuals that remain with wider priors, where priors are off.
+    """Return the findings on residuals that remain with wider priors, where priors are
+    off.
 
-    `state`: the scans and their measurements. `usual`: request with its priors. `loose_fit`: the
-    fit with wider ones. `explained`: findings with the priors; one on the beads' tolerance stays
-    if that fit frees beads.
-    Returns findings without "misfit", and without what a wide prior of the distance hides.
+    Left out are "misfit", and the pitch, which a wide prior of the distance hides.
+    `explained`: findings with the priors; those on beads' tolerance stay if the loose fit
+    frees beads.
     """
     priors = loosened({**usual.priors, **priors_of(state.scans, usual, state.model)})
     left = explain(state, replace(usual, priors=priors), loose_fit)[1]
@@ -335,10 +324,10 @@ def _left_by_priors(
 def _doubted(
     fit: FitResult, free_fit: FitResult, fixed: Mapping[str, float]
 ) -> FitResult:
-    """Widen the intervals by the change of each value between both fits, where the data doubt
-    fixed parameters by more than `DOUBT_SIGMAS`; else return `fit` as it is. `fit`: with the
-    fixed parameters; `free_fit`: with more parameters free; `fixed`: name -> fixed value, edge
-    units."""
+    """Widen the intervals by the change between both fits, if `fixed` is doubted.
+
+    That is by more than `DOUBT_SIGMAS` of fixed values (edge units) in the free fit.
+    """
     if max(held_distance(free_fit, fixed).values(), default=0.0) <= DOUBT_SIGMAS:
         return fit
     doubt = {n: free_fit.values.get(n, v) - v for n, v in fit.values.items()}

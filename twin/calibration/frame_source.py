@@ -93,17 +93,10 @@ def nothing(shape: tuple[int, int]) -> Detections:
 
 
 def look_at(image: Float32Array, detector: SpotFinder) -> FrameSpots:
-    """Detect the beads of one line-integral image.
+    """Detect the beads in line integrals (rows, cols).
 
-    A frame whose median (of every 16th row and column) exceeds `DARK` is marked DARK and
-    not searched, unless the detector is for intensities.
-
-    Args:
-        image: (rows, cols).
-        detector: settings.
-
-    Returns:
-        USABLE, perhaps without spots; or DARK without spots.
+    A frame whose median (of every 16th row and column) exceeds `DARK` is not searched,
+    unless the detector is for intensities.
     """
     shape = (image.shape[0], image.shape[1])
     if not detector.intensities and float(np.median(image[::16, ::16])) > DARK:

@@ -145,8 +145,9 @@ def _by_exposure(
     scan: Scan,
     request: CalibrationRequest,
 ) -> Finding | None:
-    """Return the finding of a wrong phantom, or where shadows are drawn out by an
-    exposure's arc that finding; None if a second measurement will follow the arc.
+    """Return the finding, or that shadows are drawn out by an exposure's arc if they are.
+
+    None if a second measurement will follow the arc.
     """
     drawn_out = _of_exposure(found, model, scan)
     if drawn_out is None:
@@ -155,11 +156,7 @@ def _by_exposure(
 
 
 def _of_exposure(found: Identification, model: BeadModel, scan: Scan) -> Finding | None:
-    """Make the error that shadows are drawn out by an exposure's arc; None if they are not.
-
-    `found`: an identification that says where the beads are; `model`: the beads; `scan`: its
-    images.
-    """
+    """Make the error that an exposure's arc draws shadows out; None if it does not."""
     arc = seen_arc(scan, model, found.parameters)
     if arc is None:
         return None

@@ -165,16 +165,16 @@ def identify_beads(
     *,
     start: Offsets = NOMINAL,
 ) -> FloatArray:
-    """Identify tracks (n, beads, 2) in pixels, nan where unseen; see `identify` for details.
+    """Identify tracks (n, beads, 2) [px], nan where unseen; see `identify`.
 
     Args:
         detections: spots of each of the n frames.
-        phantom: the beads.
-        geometry: rough geometry of each frame; see `identify`.
+        geometry: rough geometry of each frame.
         start: offsets at which the search starts.
 
     Raises:
-        TwinError: as `identify`, and if the assignment is ambiguous (a symmetric phantom).
+        TwinError: as `identify`, and if the assignment is ambiguous (a symmetric
+            phantom).
 
     Example: beads detected in rendered radiographs are found in the right order.
 
@@ -319,13 +319,8 @@ def identified(
 ) -> Identification:
     """Make the identification from known spots; nothing is fitted or checked.
 
-    Args:
-        index: (n, beads) spot of each bead, -1 unseen.
-        detections: spots of each frame.
-        start: offsets that it keeps.
-
-    Returns:
-        With residual NaN, all spots explained, no rivals.
+    `index`: (n, beads) spot of each bead, -1 unseen. The residual is NaN; there are no
+    rivals.
     """
     shadows = _Shadows.of(detections)
     origin = (np.array([d.shape[::-1] for d in detections], dtype=np.float64) - 1) / 2
@@ -565,14 +560,10 @@ def _followed(
 def _rounds(
     problem: FitProblem, shadows: _Shadows, h: _Hypothesis, gates: Sequence[float]
 ) -> _Hypothesis:
-    """Refine one hypothesis: assign spots to beads and fit in a few steps, with ever smaller
-    gates.
+    """Refine one hypothesis: assign and fit in a few steps, with ever smaller gates [px].
 
-    A hypothesis without a finite loss takes its start from a vote. All rounds have the same
-    loss, capped at 40 px, so that hypotheses can be compared.
-    `problem`: of the fit; `shadows`: the spots of all frames; `h`: the hypothesis to refine;
-    `gates`: largest distances of a spot from its bead, one a round [px].
-    Returns the refined hypothesis; with the parameters of `h` and an infinite loss if it failed.
+    Without a finite loss it starts from a vote. Returns the parameters of `h` and an
+    infinite loss if that failed.
     """
     if math.isfinite(h.loss):
         x = h.x
@@ -587,17 +578,9 @@ def _rounds(
 
 
 def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, int]:
-    """Compute the loss of an assignment: mean squared distance of spots to their beads; a
-    missing pair counts as the cap.
+    """Compute mean squared distances [px^2] of spots to beads `predicted` (n, k, 2).
 
-    Args:
-        predicted: (n, k, 2) places of the beads [px].
-        shadows: the spots of all frames.
-        cap: distance from which a spot counts as unexplained [px].
-
-    Returns:
-        The loss [px^2], per possible pair (the lesser of spots and beads in each frame),
-        and the number of explained spots.
+    Missing pairs count as the cap. Returns also the spots explained.
     """
     index = assign(predicted, shadows.points, shadows.counts, cap)
     matches = int(np.count_nonzero(index >= 0))
@@ -655,9 +638,9 @@ def _different(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
 def _finalists(
     hypotheses: Sequence[_Hypothesis], base: FloatArray, how: Search
 ) -> list[_Hypothesis]:
-    """Choose the best different hypotheses, `MAX_FINALISTS` of all and as many of those that
-    turn the phantom as is stated. `hypotheses`: best first; `base`: (6,) start of the search;
-    `how`: settings."""
+    """Choose the best different hypotheses, and as many that turn the phantom as
+    stated.
+    """
     different = _different(hypotheses)
     stated = [h for h in different[MAX_FINALISTS:] if how.allows(h.x, base)]
     return different[:MAX_FINALISTS] + stated[:MAX_FINALISTS]

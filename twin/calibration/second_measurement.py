@@ -48,22 +48,19 @@ LEAST_CONFIRMED = 0.25
 def measure_again(
     state: Calibration, request: CalibrationRequest, fit: FitResult, solids: Scene | None
 ) -> tuple[Calibration, FitResult, int]:
-    """Measure in windows and fit again; repeatedly, `MOST_ROUNDS` at most, while the fit
-    moved a prediction by `CLOSE_PX` or more.
+    """Measure in windows and fit again until predictions move by less than `CLOSE_PX`.
 
-    With few frames (`FEW_WINDOWS`) the first fit is rough, so that a draft comes before
-    the measurement, repeated while predictions move by more than `FAR_PX`. A measurement
-    that loses the spots of a scan is not fitted: state and fit are those before the first
+    There are `MOST_ROUNDS` at most. With few frames (`FEW_WINDOWS`) the first fit is
+    rough: a draft comes first, repeated while predictions move by more than `FAR_PX`. If
+    a measurement loses the spots of a scan, state and fit are those before the first
     round, with a finding.
 
     Args:
         state: the scans, identified.
-        request: the free parameters.
-        fit: to the first measurement.
-        solids: the phantom's, to subtract its body; None without solids.
+        solids: the phantom's, to subtract its body; None without.
 
     Returns:
-        The state with the measurements, the fit to them, and the iterations of all fits.
+        The state, the fit, and the iterations of all fits.
     """
     first = (state, fit)
     iterations = 0
@@ -194,12 +191,10 @@ def seen_arc(scan: Scan, model: BeadModel, parameters: Offsets) -> DrawnOut | No
 
 
 def turning_of(scan: Scan, parameters: Offsets) -> Turning | None:
-    """Make the function from a part of a step to the geometry of all frames so much later;
-    None where the stage is at rest in an exposure, as is stated, or never turns.
+    """Make the function from a part of a step to the geometry of all frames so much
+    later.
 
-    Args:
-        scan: gives the poses.
-        parameters: its offsets.
+    None if the stage rests in exposures, as stated, or never turns.
     """
     angles = scan.poses.angle
     step = usual_step(angles)

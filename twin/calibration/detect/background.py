@@ -113,11 +113,10 @@ def backdrop(behind: Background, side: int) -> Float32Array:
 def levelled(
     flat: Float32Array, slope: FloatArray, which: npt.NDArray[np.bool_]
 ) -> Float32Array:
-    """Subtract the slope of the background from some windows.
+    """Subtract the background's slope (m, 2) from the windows `which` (m,).
 
-    `flat`: (m, side, side) line integrals; `slope`: of `Background`, (m, 2); `which`: (m,)
-    windows to level.
-    Returns new windows (m, side, side), unchanged in their middles."""
+    `flat`: (m, side, side) line integrals. Returns new ones, unchanged in their middles.
+    """
     at = (np.arange(flat.shape[1]) - (flat.shape[1] - 1) / 2).astype(np.float32)
     right, down = slope[which].astype(np.float32).T[:, :, None, None]
     out = flat.copy()
@@ -131,15 +130,11 @@ def _bends(
     variance: FloatArray,
     valid: npt.NDArray[np.bool_],
 ) -> bool:
-    """Check whether bent terms explain much in the median window (`MIN_BEND_CHI2`), and
-    leave less than 0.3 of that beyond noise: they do not explain edges.
+    """Check whether bent terms explain much (`MIN_BEND_CHI2`), and leave little beyond
+    noise.
 
-    Args:
-        gain: (m,) squares that bent terms explain, in units of the variance.
-        curved: (m,) sums of squares that they leave.
-        variance: (m,) of a block's mean.
-        valid: usable blocks, (any number of windows, b); the median window's count is the
-            degrees of freedom.
+    `gain`, `curved`: (m,) squares that they explain and leave, in units of the
+    `variance`.
     """
     free = float(np.median(valid.sum(axis=1)))
     left = float(np.median(curved / np.maximum(variance, 1e-12))) - free
@@ -159,12 +154,10 @@ def _blocks(windows: Float32Array, edge: int, count: int) -> FloatArray:
 
 
 def _shapes(places: FloatArray, side: int) -> FloatArray:
-    """Evaluate the ten polynomials up to third degree (1, x, y, x x, x y, y y, ...) on a square
-    grid, planes first.
+    """Evaluate ten polynomials, 1 to y^3, on a square grid at `places` [px] of a side.
 
-    Coordinates are -1 to 1 over a window, from its middle.
-    `places`: (p,) places along a side [px]; `side`: of the window [px].
-    Returns (p^2, 10), row by row."""
+    Coordinates are -1 to 1 over the window. Returns (p^2, 10), row by row.
+    """
     t = (places - (side - 1) / 2) / (side / 2)
     y, x = (a.ravel() for a in np.meshgrid(t, t, indexing="ij"))
     one = np.ones_like(x)

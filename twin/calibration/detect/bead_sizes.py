@@ -169,14 +169,10 @@ def _settled(
 
 
 def hardened(rays: FloatArray, spread: float) -> FloatArray:
-    """Return line integrals as a beam of many energies, or one with a veil, shows them.
+    """Return line integrals as seen in polychromatic light: attenuation is Gamma
+    distributed.
 
-    Attenuations are spread as a Gamma distribution, whose mean light is
-    (1 + spread L)^(-1 / spread).
-
-    Args:
-        rays: line integrals L of the mean attenuation.
-        spread: variance of the attenuation over the square of its mean.
+    `spread`: its variance over the square of its mean.
     """
     return np.asarray(rays if spread == 0.0 else np.log1p(spread * rays) / spread)
 

@@ -79,14 +79,9 @@ class Detections:
         radii_px: float | FloatArray,
         shape: tuple[int, int],
     ) -> Detections:
-        """Make complete spots at known points, all of contrast and likeness 1 and without
-        bias; the order is kept.
+        """Make complete, unbiased spots of contrast and likeness 1 at points (k, 2) [px].
 
-        Args:
-            centers: (k, 2) column and row [px].
-            noise_px: sigma of each coordinate, one or (k,); 0 if exact.
-            radii_px: radius of the spots, one or (k,).
-            shape: the image's (rows, cols).
+        `noise_px` is the sigma of each coordinate; it and the radii are one or (k,).
         """
         k = len(centers)
         one = np.ones(k)
@@ -129,19 +124,17 @@ def detect_beads(
 ) -> Detections:
     """Detect the beads in one image.
 
-    Candidates are found in an image averaged by 4 or 2 if the smallest radius allows,
-    then measured at full resolution. Spots unlike a ball, too faint or unlike most others
-    are dropped; those cut by the image's edge are fitted. NaN counts as 0, infinity as 16
-    or 0. With the setting `intensities` the image is converted to line integrals first.
+    Spots unlike a ball, too faint or unlike most others are dropped; those cut by the
+    image's edge are fitted. NaN counts as 0, infinity as 16 or 0. With the setting
+    `intensities` the image is converted to line integrals first.
 
     Args:
         image: (rows, cols) line integrals.
         detector: settings; None is the default.
-        radius_px: (smallest, largest) radius of a spot, instead of the detector's.
+        radius_px: (smallest, largest) of a spot, instead of the detector's.
 
     Returns:
-        One row for each spot, complete ones first, each kind strongest first; `centers`
-        (k, 2) are (column, row) in pixels.
+        One row a spot, complete ones first; `centers` (k, 2) are (column, row) [px].
 
     Raises:
         TwinError: the image is not two-dimensional or has no pixel.
@@ -280,11 +273,10 @@ def _middle(values: Float32Array) -> float:
 
 
 def _distinct(found: Sequence[_Found], by: int, reach: float) -> list[_Found]:
-    """Keep one of several at a place: the one with the largest value.
+    """Keep one of those within `reach` radii: the largest by value number `by`.
 
-    `found`: sequences that begin with column, row and radius [px]; `by`: place of the value that
-    decides; `reach`: distance within which two are at one place, in radii of the kept one.
-    Returns the kept ones, by falling value."""
+    `found` begin with column, row, radius [px]. Returns those kept, by falling value.
+    """
     out: list[_Found] = []
     for one in sorted(found, key=lambda r: -r[by]):
         if all(math.hypot(one[0] - o[0], one[1] - o[1]) > reach * o[2] for o in out):
@@ -387,12 +379,11 @@ def _kinds(found: list[FloatArray]) -> list[tuple[float, float]]:
 def _cut_beads(
     image: Float32Array, spots: list[_Candidate], found: list[FloatArray]
 ) -> list[FloatArray]:
-    """Fit balls to spots at the edge, with radius and contrast of the kind that fits best.
+    """Fit balls to spots at the edge, with radius and contrast of the kind that fits
+    best.
 
-    `image`: (rows, cols) line integrals. `spots`: rough places and radii [px]; only the places
-    are used. `found`: results of the complete spots, whose kinds are tried; without any, no spot
-    is fitted.
-    Returns results of the good fits, one for each place.
+    Kinds are those of the complete spots `found`; of `spots` only the places are used.
+    Returns the good fits, one a place.
     """
     kinds = _kinds(found) if spots else []
     out: list[FloatArray] = []

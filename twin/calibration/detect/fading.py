@@ -53,12 +53,9 @@ def fading(
 
     Each bead is compared with itself in other frames, and each frame's mean is
     subtracted, so beads of several sizes and a beam that drifts have no effect. Outliers
-    (`OUTLIER_RATIO`) are left out in three rounds. Of few spots, or where little varies
-    behind the beads, the estimate is mostly its prior (`_shrunk`). Contrast C falls by at
-    most as much as the thickness behind grows, if a ball passes nothing but scattered
-    light; where scattered light is uneven it grows with the line integral, by exp(C) - 1
-    times as much. Values beyond these are an error of the level, which is in the contrast
-    too: the result is limited to them.
+    (`OUTLIER_RATIO`) are left out in three rounds. The result lies between -1 / C, as
+    where a ball passes only scattered light, and (exp(C) - 1) / C: beyond, it is an error
+    of the level.
 
     Args:
         contrast: of each bead in each frame, (n, k), above 0 where seen.
@@ -91,16 +88,13 @@ def fading(
 
 
 def _shrunk(slope: float, variance: float, free: int, contrast: float) -> Fading:
-    """Combine an estimated slope with its prior, whose width is unknown.
+    """Combine an estimated slope with its prior, normal about 0 and of unknown width.
 
-    The prior is normal about 0. Its width is of unknown order (log-uniform), from `LEAST_WIDTH`
-    to tanh(C / 4) / C: evenly scattered light changes a contrast C by no more, however much of
-    it there is. Each width counts by its evidence, a t distribution because the variance is
-    estimated, too. A slope that is told clearly is hardly changed, also beyond these widths; one
-    that is not becomes small, and sigma states what stays open.
-    `slope`: by least squares. `variance`: of it, estimated; inf: nothing is known. `free`:
-    degrees of freedom of the variance. `contrast`: the usual line integral through a bead.
-    Returns mean and standard deviation of the slope.
+    Widths are log-uniform from `LEAST_WIDTH` to tanh(C / 4) / C (evenly scattered light
+    changes a contrast C by no more), each weighted by its evidence, a t distribution. So
+    a clear slope is hardly changed, also beyond these widths.
+    `variance`: of the slope, estimated with `free` degrees of freedom; inf: nothing is
+    known. `contrast`: usual line integral through a bead.
     """
     most = math.tanh(contrast / 4.0) / contrast
     prior = np.geomspace(LEAST_WIDTH, max(most, LEAST_WIDTH), WIDTHS) ** 2
@@ -132,17 +126,8 @@ def evened(
 ) -> Float32Array:
     """Scale contrasts so that each bead has a uniform background, that of its middle.
 
-    The bead's part of each pixel is multiplied by exp(-slope times the change of the
-    background from the middle).
-
-    Args:
-        flat: (m, side, side) line integrals without the phantom's body.
-        plane: of `Background`, (m, 3).
-        body: line integrals of the body (m, side, side), or None.
-        slope: of the contrast, from `fading`.
-
-    Returns:
-        New windows (m, side, side).
+    `flat`: (m, side, side) line integrals without the `body`; `plane`: of `Background`,
+    (m, 3); `slope`: of the contrast, from `fading`. Returns new windows.
     """
     at = _from_middle(flat.shape[1])
     value, right, down = plane.astype(np.float32).T[:, :, None, None]

@@ -95,12 +95,7 @@ def missing_light(
 
 
 def with_light(images: Float32Array, part: float) -> Float32Array:
-    """Add light to images of line integrals.
-
-    Args:
-        images: line integrals, nan where there is none; not changed.
-        part: of the open beam.
-    """
+    """Add light, a part of the open beam, to line integrals (nan stays)."""
     return np.asarray(-np.log((np.exp(-images) + part) / (1.0 + part)), dtype=np.float32)
 
 

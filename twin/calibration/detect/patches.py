@@ -43,12 +43,10 @@ class Patches:
 def centroids(
     patches: Patches, index: npt.NDArray[np.intp], least: FloatArray | None = None
 ) -> FloatArray:
-    """Measure centroids in some windows by the kernel `measure`, from the expected places and
-    radii.
+    """Measure centroids in the windows `index` by the kernel `measure`.
 
-    `patches`: m windows. `index`: of those to measure. `least`: (m,) least noise, by which
-    pixels are weighted; None: 0.
-    Returns (m, RESULTS); zeros in other windows and where the measurement fails.
+    `least`: (m,) least noise, which weights pixels; None: 0. Returns (m, RESULTS); 0
+    elsewhere and where it fails.
     """
     results = np.zeros((len(patches.flat), kernels.RESULTS))
     if least is None:
@@ -68,19 +66,12 @@ def fits(
     free_radius: bool,
     masks: npt.NDArray[np.uint8],
 ) -> FloatArray:
-    """Fit balls in some windows by the kernel `fit_ball`, from the expected places.
+    """Fit balls in the windows `index` by the kernel `fit_ball`, from the expected
+    places.
 
-    The background's slope is fitted for complete spots alone.
-
-    Args:
-        patches: m windows.
-        index: of those to fit.
-        blur: of the image [px], and the veil.
-        free_radius: estimate the radius too.
-        masks: usable pixels of those windows, (len(index), side, side).
-
-    Returns:
-        (m, RESULTS); zeros in other windows and where the fit fails.
+    The background's slope is fitted for complete spots alone. `blur`: of the image [px],
+    and the veil; `masks`: usable pixels of these windows. Returns (m, RESULTS), 0
+    elsewhere and where it fails.
     """
     results = np.zeros((len(patches.flat), kernels.RESULTS))
     whole = patches.windows.whole.ravel()

@@ -401,20 +401,11 @@ def _behind(
     left: float | None,
     seen: SeenBody,
 ) -> tuple[SeenBody, Float32Array]:
-    """Render what the body adds to the line integrals.
+    """Render what the body adds to the line integrals (n, k, side, side).
 
-    Blur acts on intensities, where body and bead multiply, and so do pixels: it depends on the
-    bead in front of it.
-
-    Args:
-        images: (n, k, side, side) line integrals.
-        alone: of the beads.
-        described: the body's solids.
-        cone, model, windows: as of `measure_beads`.
-        fine, rest, balls: with which `alone` is rendered.
-        left: blur beside that of `BLURRED_FINE` rays, with which the body is estimated again;
-            None: it is taken as `seen`.
-        seen: the body, as estimated.
+    Blur acts on intensities, where body and bead multiply: it depends on the bead in
+    front. `alone`: the beads, rendered with `fine`, `rest`, `balls`. `left`: blur besides
+    `BLURRED_FINE` rays', with which the body is estimated again; None: `seen` is kept.
     """
     if left is not None:
         seen = see_body(images, described, cone, model, windows, left, seen)
@@ -432,11 +423,9 @@ def _body(
     model: BeadModel,
     windows: Windows,
 ) -> tuple[SeenBody, Float32Array | None]:
-    """Estimate the phantom's body in the images, and render it.
+    """Estimate the phantom's body in line integrals (n, k, side, side), and render it.
 
-    `images`: (n, k, side, side) line integrals; `described`: the body's solids; `cone` and
-    `model` and `windows`: as of `measure_beads`.
-    Returns the body, and its line integrals; None where none is described or seen.
+    `described`: its solids. Returns also None where none is described or seen.
     """
     if not described.solids:
         return NO_BODY, None

@@ -269,10 +269,10 @@ def _rings_of(images: npt.NDArray[np.float32], few: Windows) -> _Rings:
 def _shift_of_beads(
     cone: ConeVec, model: BeadModel, beads: npt.NDArray[np.intp], shape: tuple[int, int]
 ) -> FloatArray:
-    """Compute how the spot of a bead moves with the bead, by a difference of 1 mm.
+    """Compute how spots move with their beads, by a difference of 1 mm.
 
-    `cone`: m views; `model`: the beads; `beads`: (m,) number of the bead in each view; `shape`:
-    (rows, cols). Returns (m, 2, 3) pixels (column, row) for a millimeter along x, y and z."""
+    `beads`: (m,) bead in each view. Returns (m, 2, 3) pixels per mm along x, y, z.
+    """
     one = np.arange(len(beads))
     there = cone.project_points(model.beads, shape)[one, beads]
     moved = [cone.project_points(model.beads + e, shape)[one, beads] for e in np.eye(3)]

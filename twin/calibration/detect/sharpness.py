@@ -68,13 +68,8 @@ _Tried = tuple[FloatArray, FloatArray, FloatArray]
 def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene:
     """Make a scene of the beads alone, in the order of the model.
 
-    Each attenuates so that its line integral through the center is the contrast, at least
-    0.001.
-
-    Args:
-        model: the phantom's beads.
-        contrast: (k,) line integrals through their centers.
-        size: factor on the radii.
+    `contrast`: (k,) line integrals through their centers, 0.001 at least. `size`: factor
+    on the radii.
     """
     return Scene(
         tuple(
@@ -90,23 +85,16 @@ def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene
 
 
 def rest_of_blur(blur: float, fine: int) -> float:
-    """Compute the blur left to apply after averaging fine x fine rays of a pixel.
-
-    Args:
-        blur: of the images [px].
-        fine: rays along a pixel's side.
-
-    Returns:
-        Standard deviation [px], not negative.
+    """Compute the blur [px] left after averaging fine x fine rays of a pixel, 0 at
+    least.
     """
     return math.sqrt(max(blur**2 - pixel_variance(fine), 0.0))
 
 
 def fine_rays(windows: Windows, rays: int, least: int) -> int:
-    """Return the rays along a pixel's side with which a bead's radius has a number of rays.
-
-    `windows`: of the beads; `rays`: along the radius of the typical bead; `least`: fewest along
-    a pixel's side. Returns the number; `EXPOSED_FINE` where frames are exposed over moments."""
+    """Return the rays along a pixel's side that put `rays` along the usual bead's
+    radius.
+    """
     if windows.moments:
         return EXPOSED_FINE
     fine = math.ceil(rays / float(np.median(windows.radii)))
@@ -288,14 +276,7 @@ def _profiles_of(
 def _rendered(
     patches: Patches, sample: npt.NDArray[np.intp], seen: Float32Array, few: Windows
 ) -> Patches:
-    """Return some windows with rendered line integrals in place of the images'.
-
-    Args:
-        patches: windows of the images.
-        sample: (j,) indices of the rendered ones.
-        seen: their line integrals, (j, side, side) in any shape.
-        few: their places.
-    """
+    """Return the windows `sample` (j,) with rendered line integrals `seen` instead."""
     return replace(
         patches,
         flat=seen.reshape(-1, few.side, few.side),
@@ -421,12 +402,10 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
 
 
 def _lowest(tried: FloatArray, misfit: FloatArray) -> float:
-    """Find the minimum of a misfit: a hyperbola about the right place, so its square is a
-    parabola.
+    """Find the minimum of a misfit whose square is a parabola near it.
 
-    `tried`: (n,) increasing trial values. `misfit`: (n,) their misfits; inf where not tried.
-    Returns the minimum between the trials next to the best one; the best trial itself at an end,
-    next to one that was not tried, or if the parabola opens downwards.
+    Returns a place between the neighbors of the best of the increasing trials; that trial
+    itself at an end, beside one not tried (inf), or if the parabola opens downwards.
     """
     i = int(np.argmin(misfit))
     near = slice(i - 1, i + 2)

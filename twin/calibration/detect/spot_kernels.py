@@ -50,17 +50,13 @@ def bias_factor(ratio, power):  # type: ignore[no-untyped-def]
 
 @linked
 def weight_power(noise):  # type: ignore[no-untyped-def]
-    """Return the power of the line integral that weights the centroid: 4 for noise below
-    0.002, 3 below 0.006, 2.5 below 0.02, else 2.
+    """Return the power of the line integral that weights the centroid, for a noise.
 
-    A ball's chord rises from its rim with a vertical slope, which pixels sample badly: a
-    centroid weighted by the chord errs by 0.006 to 0.008 px even without noise, by its
-    square 0.0015, by its cube 0.0005, by its fourth power 0.0001. Noise speaks for lower
-    powers (best of a scan over powers and caps).
-
-    Args:
-        noise: of the line integrals.
+    Pixels sample a ball's rim badly: the chord's power 1 errs by 0.007 px without noise,
+    4 by 0.0001.
     """
+    # Noise speaks for lower powers: best of a scan over powers and caps. Without noise a
+    # power of 2 errs by 0.0015 px, of 3 by 0.0005.
     if noise < 0.002:
         return 4.0
     if noise < 0.006:
@@ -72,17 +68,10 @@ def weight_power(noise):  # type: ignore[no-untyped-def]
 
 @linked
 def weight_cap(noise, peak, cap):  # type: ignore[no-untyped-def]
-    """Return the line integral above which the weight is constant: a bead's middle is the
-    noisiest.
+    """Return the line integral above which the weight is constant, `cap` at most.
 
-    The noise of a logarithm grows as exp(L / 2) from `noise` at the background; above 0.3
-    it is of no use. Below that, a share of the peak (best of the same scan), 2 at least;
-    twice the peak, no real limit, for noise below 0.002.
-
-    Args:
-        noise: of the background.
-        peak: line integral through the middle.
-        cap: largest result.
+    A bead's middle is noisiest: the noise of a logarithm grows as exp(L / 2), and above
+    0.3 is of no use.
     """
     limit = min(cap, max(1.5, 2.0 * math.log(0.3 / max(noise, 1e-6))))
     if noise < 0.002:

@@ -149,22 +149,11 @@ def plan_windows(
 def shadow_ellipses(
     model: BeadModel, cone: ConeVec, predicted: FloatArray, shape: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute the ellipses that the beads cast on the detector.
+    """Compute the ellipses that the beads cast on the detector from centers (n, k, 2)
+    [px].
 
-    A ball's spot is the section of its tangent cone (half-angle beta, axis at theta from
-    the detector's normal): semi-axes f sin b / sqrt(cos^2 t - sin^2 b) and, towards the
-    foot point, cos b / sqrt(cos^2 t - sin^2 b) times that.
-
-    Args:
-        model: k beads.
-        cone: geometry of n frames.
-        predicted: (n, k, 2) centers of the spots [px].
-        shape: (rows, cols) of the detector.
-
-    Returns:
-        Minor semi-axes (n, k) [px of columns]; direction of the major ones (unit, column
-        and row; (1, 0) at the foot point) and major over minor axis, 1 at least, (n, k,
-        3).
+    Returns minor semi-axes (n, k) [px of columns], and (n, k, 3): direction of the major
+    ones (column, row; (1, 0) at the foot point) and major over minor axis.
     """
     minor, ratio = _semi_axes(model, cone)
     away = predicted - cone.piercing_points(shape)[:, None]
@@ -175,8 +164,9 @@ def shadow_ellipses(
 
 def _semi_axes(model: BeadModel, cone: ConeVec) -> tuple[FloatArray, FloatArray]:
     """Compute the minor semi-axes [px of columns] of the shadows of k beads in n frames, and
-    major over minor axis, each (n, k); see `shadow_ellipses`.
+    major over minor axis, each (n, k).
     """
+    # A section of the ball's tangent cone: half-angle b, axis at t from the panel's normal.
     ray = model.beads[None] - cone.source[:, None]
     distance = np.linalg.norm(ray, axis=2)
     cos_t = np.einsum("nkj,nj->nk", ray, cone.normal) / distance
@@ -333,13 +323,8 @@ def render_windows(
 ) -> Float32Array:
     """Render line integrals of a scene in every window, (n, k, side, side).
 
-    Args:
-        scene: solids.
-        cone: geometry.
-        windows: their places; also parts off the image are rendered.
-        fine: fine x fine rays in a pixel; their intensities are averaged, as a real pixel
-            does. One ray (1, the default) puts an edge up to half a pixel off.
-        balls: beads that harden the beam, besides the scene.
+    fine x fine rays' intensities are averaged; one ray puts an edge up to half a pixel
+    off. `balls`: beads that harden the beam.
     """
     if fine == 1 and not windows.moments:
         return _hardened_rays(scene, cone, windows, np.zeros(2), balls)
@@ -535,8 +520,7 @@ def ways(windows: Windows, model: BeadModel, turning: Turning) -> FloatArray:
 def lattice(fine: int) -> list[tuple[float, float]]:
     """Return places (column, row) of fine^2 rays in a pixel, from its center.
 
-    A square grid turned so that no two rays share a column or a row: an edge along either is
-    placed to 1 / fine^2 pixels, where a straight grid places it to 1 / fine.
+    No two share a column or row, so that an edge along either is placed to 1 / fine^2 px.
     """
     n = fine * fine
     out = []
@@ -551,22 +535,11 @@ def lattice(fine: int) -> list[tuple[float, float]]:
 def spread_lattice(
     windows: Windows, fine: int, moment: int = 0
 ) -> list[tuple[FloatArray, Float32Array]]:
-    """Return places of fine^2 rays in the pixels of n frames of k windows, and their
-    weights.
+    """Return (n, k, 2) places of fine^2 rays in windows' pixels, and weights (n, k).
 
-    Each window has the lattice shifted by another part of its step, and weights that keep
-    the middle of the light in that of the pixel. An edge that stays at one place of the
-    pixel grid, as of a body at the source's height, would else be misplaced alike in all
-    frames.
-
-    Args:
-        windows: of the beads.
-        fine: rays along each side of a pixel, 2 at least.
-        moment: number of a moment of the exposure; others have another shift.
-
-    Returns:
-        For each ray its place (column, row) from the pixel's center, (n, k, 2), and its
-        weight (n, k), of sum 1 over the rays.
+    Each window, and each `moment` of the exposure, has the lattice shifted otherwise, or
+    an edge at one place of the grid is misplaced alike in all frames; weights keep the
+    middle of the light in the pixel's.
     """
     n, k = windows.corner.shape[:2]
     number = np.arange(n)[:, None] + n * np.arange(k) + n * k * moment
@@ -655,13 +628,9 @@ def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.b
 def distances2(
     corner: npt.NDArray[np.int64], side: int, places: FloatArray
 ) -> FloatArray:
-    """Compute squared distances of the pixels of windows from a place each, (..., side,
-    side) [px^2].
+    """Compute squared distances [px^2] of windows' pixels from places (..., 2).
 
-    Args:
-        corner: (..., 2) column and row of each window's first pixel.
-        side: windows are side x side pixels.
-        places: (..., 2) column and row.
+    Returns (..., side, side).
     """
     i = np.arange(side)
     x, y = np.moveaxis((places - corner)[..., None], -2, 0)
@@ -690,14 +659,9 @@ def blur_kernel(blur: float) -> FloatArray:
 
 
 def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
-    """Blur line integrals as intensities, exp(-p); edges are repeated outwards.
+    """Blur line integrals (n, k, side, side) as intensities, edges repeated.
 
-    Args:
-        line_integrals: (n, k, side, side).
-        blur: standard deviation [px].
-
-    Returns:
-        New line integrals of that shape.
+    `blur` is the standard deviation [px].
     """
     out = blurred_light(np.exp(-line_integrals), blur_kernel(blur))
     return np.asarray(-np.log(out), dtype=np.float32)

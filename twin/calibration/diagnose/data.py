@@ -305,14 +305,11 @@ def _extra(found: Identification, counts: npt.NDArray[np.intp]) -> bool:
 
 
 def _without_bad_frames(found: Identification) -> Identification:
-    """Drop single frames that the others contradict from an assignment: those with at
-    most 0.7 of the usual number of beads. Its residual becomes the typical one.
+    """Drop single frames with at most 0.7 of the usual beads, which the others
+    contradict.
 
-    After the fit they are listed; they do not suggest another phantom.
-
-    Returns:
-        A copy; the assignment itself without such frames, or if they are more than a
-        fifth.
+    After the fit they are listed. The residual becomes the typical one. Returns `found`
+    itself without such frames, or if they are more than a fifth.
     """
     seen = (found.index >= 0).sum(axis=1)
     if seen.any():

@@ -457,18 +457,9 @@ def doubtful(
 ) -> FitResult:
     """Widen the intervals by the change that each possible cause alone would make.
 
-    Images that contradict the priors determine the wrong combination of parameters, and
-    the widths of the priors divide it among them: the narrower is believed, although it
-    may be the wrong one.
-
-    Args:
-        fit: with the priors.
-        judged: the priors compared with the images.
-        without: makes the fit without the prior of a parameter.
-
-    Returns:
-        The same values with wider intervals; `fit` itself without causes. Fits that are
-        not determined are ignored.
+    Of wrong priors the narrower is believed, although it may be the wrong one. `without`
+    makes the fit without the prior of a parameter; fits that are not determined are
+    ignored.
     """
     for name in dict.fromkeys(cause.split("@")[0] for cause in judged.causes):
         other = without(name)
@@ -500,26 +491,16 @@ def _deviate(chance: float) -> float:
 
 
 def _deviate_of(ratio: float, freedom: float) -> float:
-    """Return the normal deviate that is about as improbable as a deviation in sigmas.
+    """Return the normal deviate about as improbable as a ratio in sigmas (Student).
 
-    Source: Wallace, Annals of Mathematical Statistics 30 (1959) 1121; it has no largest value.
-
-    Args:
-        ratio: the deviation over its sigma.
-        freedom: degrees of freedom with which sigma is known (Student).
+    Source: Wallace, Annals of Mathematical Statistics 30 (1959) 1121.
     """
     share = (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0)
     return share * math.sqrt(freedom * math.log1p(ratio**2 / freedom))
 
 
 def _chance(square: float, count: int, freedom: float) -> float:
-    """Return the probability of a larger sum of squares in sigmas.
-
-    Args:
-        square: the sum.
-        count: of the squares.
-        freedom: degrees of freedom with which the sigmas are known (Fisher).
-    """
+    """Return the probability of a larger sum of `count` squares in sigmas (Fisher)."""
     return float(fdtrc(count, freedom, max(square, 0.0) / count))
 
 

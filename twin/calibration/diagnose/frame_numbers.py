@@ -49,12 +49,7 @@ class FrameNumbers:
     fits: npt.NDArray[np.bool_]
 
     def shown(self, poses: Poses) -> Poses:
-        """Compute the pose that each frame shows; beyond the ends, the first and the last
-        step go on.
-
-        Args:
-            poses: of the n frames by their own numbers, n two at least.
-        """
+        """Return the pose that each frame shows; the end steps go on beyond the ends."""
         return _at_numbers(poses, np.arange(len(poses)) + self.shift)
 
     @property

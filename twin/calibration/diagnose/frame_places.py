@@ -30,17 +30,12 @@ LEAST_ASIDE: Final = 4
 
 
 def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> list[Finding]:
-    """Judge frames whose spots are not at the fitted places: wrong angles, a slip, a repeated
-    image.
+    """Judge frames whose spots are not at the fitted places, each scan by itself.
 
-    A frame is bad if most of its complete spots are 5 px or more from every prediction, or most
-    of its positions had to be left out of the fit; frames of fewer than two spots and repeated
-    ones have no spots to judge. Every scan is judged by itself: wrong frame numbers come first.
-    Otherwise a block of frames at an end, with no drift but the angle's, is an error
-    ("angle_step"); else "frames_inconsistent": an error for more than 30 % of the frames, else a
-    warning. At most 12 frames are listed, a block as first to last.
-    `fit`: to all frames; `looks`: spots and state of each frame of each scan.
-    Returns one finding a scan at most, that lists the frames, or names their numbers.
+    A frame is bad if most of its complete spots are 5 px or more from every prediction,
+    or most positions were left out of the fit. Wrong frame numbers come first; then a
+    block at an end ("angle_step"); else "frames_inconsistent", an error for more than 30
+    % of the frames. Returns a finding a scan at most.
     """
     group = np.repeat(np.arange(len(looks)), [len(some) for some in looks])
     predicted = fit.problem.residuals(fit.solution.x)[0]

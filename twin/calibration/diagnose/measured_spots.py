@@ -41,15 +41,10 @@ MAX_BODY_MM = 0.3
 def judge_first_sizes(
     state: Calibration, request: CalibrationRequest, fit: FitResult
 ) -> list[Finding]:
-    """Judge the sizes of spots in the first measurement against those predicted by the fit.
+    """Judge the sizes of spots in the first measurement against those the fit predicts.
 
-    Args:
-        state: scans, identified, with their spots.
-        request: whether a second measurement follows; then a deviation of `BLURRED_FIRST` is
-            allowed now, as blur makes spots wider, else `OTHER_BEADS`.
-        fit: gives the geometry of each scan.
-
-    Returns at most one finding for each scan; empty if all fit.
+    `BLURRED_FIRST` is allowed where a second measurement follows, as blur makes spots
+    wider, else `OTHER_BEADS`. Returns a finding a scan at most.
     """
     out = []
     if request.second_look:
@@ -64,14 +59,10 @@ def judge_first_sizes(
 
 
 def judge_sizes(state: Calibration, fit: FitResult) -> list[Finding]:
-    """Judge in each scan the bead sizes of the second measurement, or of the first (with
-    `OTHER_BEADS`) where the second measured no size and the spots are not smeared.
+    """Judge the bead sizes of each scan by its second measurement.
 
-    Args:
-        state: scans, spots, identifications and the second measurements.
-        fit: of the geometry, which predicts the spots' radii.
-
-    Returns findings on sizes that do not fit, at most one a scan; empty if all fit.
+    Without one, and spots not smeared, the first counts (`OTHER_BEADS`). Returns a
+    finding a scan at most.
     """
     out = []
     for g, scan in enumerate(state.scans):
@@ -87,18 +78,10 @@ def judge_sizes(state: Calibration, fit: FitResult) -> list[Finding]:
 def judge_first_size(
     found: Identification, looks: Sequence[FrameSpots], radii: FloatArray, allowed: float
 ) -> Finding | None:
-    """Judge sizes coarsely from the first measurement: the median ratio of measured to
-    expected radii of complete, identified spots.
+    """Judge sizes by the median ratio of measured to expected radii (n, k) [px].
 
-    Args:
-        found: the bead of each spot.
-        looks: of every frame.
-        radii: (n, k) expected radii [px].
-        allowed: deviation that may be blur, as a share.
-
-    Returns:
-        An error on bead sizes; None if the ratio is within `allowed` of 1, or there is no
-        such spot.
+    Complete, identified spots count. Returns an error; None within `allowed` (a share,
+    for blur), or without a spot.
     """
     ratios = [
         look.detections.radii_px[j] / radii[f, b]
@@ -116,16 +99,10 @@ def judge_first_size(
 
 
 def judge_size(measured: Refined) -> Finding | None:
-    """Judge the beads' size in the images against the stated one.
+    """Judge the beads' size in the images (nan: unknown) against the stated one.
 
-    A phantom of another scale at another distance gives the same bead positions; only the beads'
-    own size reveals it.
-
-    Args:
-        measured: size (nan if unknown) with its sigma, and blur.
-
-    Returns an error beyond `HELD_SIGMAS` of both the size's sigma and the beads' tolerance; a
-    warning where only the size's own sigma allows it; None if the size fits or is unknown.
+    Only it tells a phantom of another scale at another distance. Returns an error beyond
+    `HELD_SIGMAS` of size and tolerance; a warning where only the size's sigma allows it.
     """
     off = abs(math.log(measured.size))
     known = HELD_SIGMAS * math.hypot(measured.size_sigma, SIZE_TOLERANCE)
@@ -239,11 +216,9 @@ def beside_missing_light(finding: Finding) -> Finding:
 
 
 def judge_smear(smear: Smear, step_rad: float) -> Finding | None:
-    """Make the warning that the object turns during an exposure, with the arc [deg] and its
-    share of a step.
+    """Warn that the object turns in an exposure, if that is beyond doubt.
 
-    `smear`: of the spots of a scan; `step_rad`: of the stage, from frame to frame.
-    Returns None if the smear does not show it beyond doubt.
+    `step_rad`: of the stage, from frame to frame.
     """
     if not smear.named:
         return None

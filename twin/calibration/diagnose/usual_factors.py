@@ -34,10 +34,7 @@ def usual_reason(
 ) -> str:
     """Return the reason whose factor is nearest to a ratio; "" if none is near.
 
-    Args:
-        ratio: above 0.
-        reasons: factor -> reason.
-        within: difference of logarithms that is near.
+    `within`: difference of logarithms that is near.
 
     Example:
         >>> usual_reason(0.52, OF_RADII)

@@ -381,9 +381,9 @@ class Certificate:
 
     @property
     def wide(self) -> tuple[Direction, ...]:
-        """Requested parameters that are stated worse than the bound only because of causes
-        that are open. Nothing that the images show is lacking, and such causes are open in one of
-        twenty right scans, so this is no reason not to use the fit.
+        """Requested parameters stated worse than the bound only by causes that are open.
+
+        Such causes are open in one of twenty right scans: no reason not to use the fit.
         """
         known = {n for d in self.open for n in d.names}
         stated = {
@@ -454,14 +454,9 @@ class Certificate:
             return np.asarray(np.sqrt(square.sum(axis=(axis, 2)) / count))
 
     def mahalanobis2(self, truth: Mapping[str, float]) -> float:
-        """Compute the squared distance of some values from the estimates, in the
-        covariance of those columns, along the bend of their region.
+        """Compute the squared distance of values (edge units) from the estimates.
 
-        Args:
-            truth: column -> value, edge units, some or all reported columns.
-
-        Raises:
-            ValueError: a name of `truth` that is not reported.
+        Along the region's bend. Raises ValueError for a column not reported.
         """
         at, off = self._places(truth)
         return self.bend().distance2(off, at, self.covariance[np.ix_(at, at)])
@@ -701,18 +696,15 @@ def _of_what_was_asked(given: Conditioning, whole: Conditioning) -> Conditioning
 def spread_of_residuals(
     problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_], prior_noise: float
 ) -> tuple[float, float]:
-    """Compute the standard deviation of the whitened residuals at `x`, and its degrees of
+    """Compute the standard deviation of whitened residuals at `x`, and degrees of
     freedom.
 
-    A column costs the part of a degree of freedom that the images, not its prior, determine
-    (MacKay, Neural Computation 4 (1992) 415): a wide prior costs a full one. Where priors are
-    moved by more than that to fit the images, their shifts count as residuals. A spread that the
-    problem expects counts as `SPREAD_FREEDOM` residuals.
-
-    `problem`: the data; `x`: column values, internal units; `use`: (n, k) positions that
-    counted; `prior_noise`: spread of the whitened residuals with which the priors were weighed.
-    Returns the standard deviation and the degrees of freedom; (nan, 0) for `LEAST_FREEDOM` or
-    fewer.
+    A column costs the part of a degree of freedom that the images, not its prior,
+    determine (MacKay, Neural Computation 4 (1992) 415). Where priors are moved by more
+    than that, their shifts count as residuals. A spread that the problem expects counts
+    as `SPREAD_FREEDOM` residuals.
+    `use`: (n, k) positions that counted; `prior_noise`: with which priors were weighed.
+    Returns (nan, 0) for `LEAST_FREEDOM` or fewer.
     """
     _, _, norms, _, normal, _ = problem.evaluate(x, use, 1)
     weight = problem.prior_weight(prior_noise)

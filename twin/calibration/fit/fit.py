@@ -200,11 +200,10 @@ def solve(
 
 
 def _spread(norms: FloatArray, columns: int, floor: float) -> float:
-    """Compute the robust standard deviation of whitened residuals, larger for few degrees of
-    freedom: a fit absorbs part of the noise, and a median of few is unreliable.
+    """Compute the robust sigma of (m,) lengths of residuals, larger for few data.
 
-    `norms`: (m,) lengths of 2-vectors; `columns`: number of fitted columns; `floor`: least
-    result. Returns inf without degrees of freedom."""
+    A fit absorbs noise, and a median of few is unreliable. Returns inf without freedom.
+    """
     dof = 2 * len(norms) - columns
     if dof <= 0:
         return math.inf
@@ -263,10 +262,7 @@ def _levenberg(
         return cost + 0.5 * float(weight @ off**2), norms, hess, grad + weight * off
 
     def threshold(norms: FloatArray) -> float:
-        """Compute the residual norm beyond which Huber's loss is linear: `how.huber`
-        times the robust spread of the used residuals, or `how.floor_px` if that is larger
-        [whitened units]; the floor without used ones.
-        """
+        """Compute the whitened residual norm beyond which Huber's loss is linear."""
         if use.any():
             spread = _median(norms[use]) / RAYLEIGH_MEDIAN
         else:
@@ -343,9 +339,7 @@ def _step(hess: FloatArray, grad: FloatArray, damping: float) -> FloatArray | No
 
 
 def cost_at(problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_]) -> float:
-    """Compute half the sum of squared whitened residuals of the positions `use`, without
-    priors; inf where a bead would be behind the source.
-    """
+    """Compute half the whitened squares of `use`, no priors; inf behind the source."""
     try:
         norms = problem.residuals(x)[1]
     except TwinError:
@@ -629,11 +623,10 @@ def require_identifiable(result: FitResult) -> FitResult:
 
 
 def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
-    """Return the result of a chain of fits, counted from the start of the first; estimates stay.
+    """Return the result of a chain of fits, counted from the start of the first.
 
-    `result`: the last fit of the chain. `start`: offsets of all groups at which the first fit
-    started; the start cost is computed there, for the positions used in the end. `iterations`:
-    of all fits together.
+    `start`: offsets of all groups there; its cost is that of the positions used in the
+    end.
     """
     problem = result.problem
     base = np.array(
@@ -675,17 +668,11 @@ def _followed(
 def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float]:
     """Solve a problem, and weight its priors by the spread of the residuals.
 
-    Few positions (up to `FEW_VALUES` coordinates a column) may be explained in two ways: by
-    priors that hold and noise, or by priors that are off and hardly any noise. Then smaller
-    spreads (`QUIET_SHARES`) are tried, too, and one is taken if it is more likely by
+    Few positions (up to `FEW_VALUES` coordinates a column) may be explained by priors
+    that hold and noise, or by priors that are off and hardly any noise. Then smaller
+    spreads (`QUIET_SHARES`) are tried, and one is taken if it is more likely by
     `QUIET_LOG_ODDS`.
-
-    Args:
-        problem: data, columns and priors.
-        solver: settings; the default is robust.
-
-    Returns the solution, and the spread of the whitened residuals by which its priors were
-    weighted.
+    Returns also the spread of the whitened residuals that weighted the priors.
     """
     found = _weighted(problem, solver, problem.start, 1.0)
     weighed = bool(np.isfinite(problem.prior_sigma).any())
@@ -706,14 +693,10 @@ def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float
 def _weighted(
     problem: FitProblem, solver: Solver | None, x: FloatArray, noise: float
 ) -> tuple[Solution, float]:
-    """Solve a problem from a spread of the residuals on, until that spread repeats itself within
-    1 %, four times at most; once without priors.
+    """Solve a problem from a spread of the residuals on, until that repeats within 1 %.
 
-    `problem`: the data and columns; `solver`: settings; `x`: start of the columns; `noise`:
-    start of the spread of the whitened residuals.
-    Returns the last solution, and the spread by which its priors were weighted; after four
-    rounds that have not settled, the one that this solution gave. `LEAST_NOISE` at least if it
-    is estimated.
+    Four rounds at most; one without priors. Returns the last solution, and the spread
+    that weighted its priors; if not settled, the one it gave (`LEAST_NOISE` at least).
     """
     for _ in range(4):
         solution = solve(problem, solver, x=x, prior_noise=noise)

@@ -126,12 +126,11 @@ def forecast(
 
 
 def _ranges(names: Iterable[str], sigmas: FloatArray) -> dict[str, tuple[float, float]]:
-    """Find between which values the sigma of one more scan lies in `MOST` of all cases.
+    """Find between which values one more scan's sigma lies in `MOST` of all cases.
 
-    Of m scans and one more, each place in their order is as likely as any other, whatever the
-    sigmas' distribution. What is nearly certain lies there more often, for `FIRST_ORDER`.
-    `names`: of the q quantities; `sigmas`: (m, q) of m scans.
-    Returns name -> least and largest."""
+    Of m scans (m, q) and one more, each order is as likely as any other. What is nearly
+    certain lies there more often, for `FIRST_ORDER`.
+    """
     ordered = np.sort(sigmas, axis=0)
     cut = round((1.0 - MOST) / 2.0 * (len(sigmas) + 1))
     low = ordered[cut - 1] / (1.0 + FIRST_ORDER)

@@ -91,11 +91,9 @@ def known(
     """Return standard deviations of every offset before its images are seen.
 
     Args:
-        free: parameters that are estimated; only a user's own width is a prior of these,
-            and 0 is ignored for them.
-        given: widths that a user states, in place of all others; None: no widths; "none":
-            all that are not free are exact.
-        scanners: widths of the scanners, of which (and of `FIXED`) the widest counts.
+        free: estimated parameters; only a user's own width is a prior of these, not 0.
+        given: widths in place of all others; None: none; "none": all else is exact.
+        scanners: widths, of which (and of `FIXED`) the widest counts.
 
     Returns:
         Parameter -> standard deviation [mm, deg, 1]; 0 is exactly known.
@@ -126,25 +124,18 @@ def known_strain(
     given: Given | None = None,
     bead_tolerance_mm: float | None = None,
 ) -> Strain:
-    """Compute standard deviations [1] of the phantom's stretches and shears, beside those of
-    its scale: `STRAIN`, or
-    the beads' tolerance over the phantom's size (root mean square distance of beads) if
-    that is less.
+    """Compute standard deviations [1] of the phantom's stretches and shears.
 
-    Errors within a tolerance may be alike: a phantom that shrinks by it has all beads
-    within it.
+    They are the lesser of `STRAIN` and the beads' tolerance over the phantom's size
+    (errors within a tolerance may be alike), no more than a stated scale's.
 
     Args:
-        model: the phantom's beads.
-        free: parameters that are estimated.
-        given: widths that a user states of the scanner; None: no widths.
-        bead_tolerance_mm: of the beads, stated by a user in place of the phantom's; None:
-            not stated.
+        given: widths that a user states; None: none.
+        bead_tolerance_mm: stated in place of the phantom's; None: not stated.
 
     Returns:
-        Of stretches, and of shears, equal, no more than a stated scale's. `UNSTRAINED` (0,
-        0) if the beads are stated to be exact or anywhere in the phantom, beads and scale
-        are stated, or every offset of the scanner that is not free is stated as exact.
+        `UNSTRAINED` if the beads are exact or anywhere, beads and scale are stated, or
+            all offsets that are not free are exact.
     """
     stated = exact(free) if given == "none" else given or {}
     if all(stated.get(name) == 0.0 for name in OFFSETS if name not in free):
@@ -169,11 +160,9 @@ def known_scale(
     given: Given | None = None,
     bead_tolerance_mm: float | None = None,
 ) -> float:
-    """Compute the standard deviation [1] of the phantom's scale: the stated one, else that of
-    a stretch (`known_strain`, whose arguments these are).
+    """Compute the standard deviation [1] of the phantom's scale.
 
-    Returns:
-        0 where it is exact, or where beads are anywhere in the phantom.
+    The stated one, else a stretch's (`known_strain`).
     """
     if isinstance(given, Mapping) and PHANTOM in given:
         return given[PHANTOM]
@@ -190,17 +179,10 @@ def gives_room(name: str, width: float) -> bool:
 def with_tolerance(
     model: BeadModel, given: Given | None, bead_tolerance_mm: float | None
 ) -> tuple[Given | None, float | None]:
-    """Add what a phantom's file states of its scale and beads to what a user states; a user's
-    tolerance replaces both.
+    """Add what a phantom's file states of its scale and beads to a user's widths.
 
-    Args:
-        model: the phantom's beads.
-        given: widths that a user states.
-        bead_tolerance_mm: of the beads, stated by a user; None: not stated.
-
-    Returns:
-        The widths, with the phantom's scale, and the tolerance, each as given where the
-        phantom does not say.
+    `bead_tolerance_mm`: a user's, which replaces both; None: not stated. Returns widths
+    and tolerance, as given where the phantom says nothing.
     """
     stated = model.stated
     if stated is None or bead_tolerance_mm is not None or given == "none":
@@ -219,19 +201,10 @@ def exact(free: Container[str] = SIX) -> dict[str, float]:
 def prior_widths(
     machine: Machine | None = None, profile: Profile | None = None
 ) -> dict[str, float]:
-    """Return the standard deviation of each offset of a scanner: the profile's where that
-    states one, else the machine's, else the assumed one (`ASSUMED`).
+    """Return standard deviations of a scanner's offsets [mm, deg, 1].
 
-    Args:
-        machine: None: states none.
-        profile: None: states none.
-
-    Returns:
-        Parameter -> standard deviation [mm, deg, 1], in a new dictionary.
-
-    Example:
-        >>> prior_widths()["dD_z"]
-        1.0
+    The profile's, else the machine's, else the assumed (`ASSUMED`):
+    `prior_widths()["dD_z"]` is 1.0.
     """
     out = dict(ASSUMED)
     for stated in (machine, profile):

@@ -516,18 +516,10 @@ class FitProblem:
     def residuals(
         self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Predict positions on the panel as it is, and lengths of whitened residuals.
+        """Predict positions [px] of all beads, (n, k, 2), and lengths of whitened
+        residuals.
 
-        Args:
-            x: column values, internal units.
-            use: (n, k) positions that count; None: the seen ones.
-
-        Returns:
-            Pixels of the image (n, k, 2) of all beads, and lengths (n, k), -1 where a
-            position is not used.
-
-        Raises:
-            TwinError: a bead is at or behind the source.
+        Lengths (n, k) are -1 where unused. Raises TwinError behind the source.
         """
         predicted, norms, _ = self._evaluate(x, self.seen if use is None else use, 0)
         return predicted + self.origin[:, None, :], norms
@@ -553,10 +545,11 @@ class FitProblem:
     def _evaluate(
         self, x: FloatArray, use: npt.NDArray[np.bool_], want: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Evaluate the problem at `x`; see `evaluate`, also for the arguments.
+        """Evaluate the problem at `x`, as `evaluate`.
 
-        Returns predictions from the detector's center, norms of the whitened residuals, and the
-        Jacobian. Raises TwinError: a bead is at or behind the source."""
+        Returns predictions from the detector's center, residuals' norms, Jacobian. Raises
+        TwinError: a bead is at or behind the source.
+        """
         cost, predicted, norms, jac, _, _ = self.evaluate(x, use, want)
         if not np.isfinite(cost):
             raise TwinError("a bead lies at or behind the source in this geometry")
@@ -832,12 +825,7 @@ def usual_step(angle: FloatArray) -> float:
 
 
 def panel_heights(measured: FloatArray, origin: FloatArray) -> FloatArray:
-    """Compute the row of each position, from the panel's middle, in panel heights, (n, k).
-
-    Args:
-        measured: (n, k, 2) pixels from the panel's center.
-        origin: (n, 2) pixel coordinates of that center.
-    """
+    """Compute rows from the panel's middle in panel heights, (n, k)."""
     return np.asarray(measured[..., 1] / (2.0 * origin[:, None, 1] + 1.0))
 
 
@@ -854,25 +842,20 @@ def turning_shifts(
     reading: Reading,
     places: FloatArray,
 ) -> FloatArray:
-    """Compute shifts of the beads' positions by a stage that turns on, by the median step
-    of the frame's group: while a frame is exposed, and while its rows are read.
+    """Compute shifts of beads' positions by a stage that turns on, by a usual step a
+    frame.
 
-    A path p of the angle has the mean p + p'' arc^2 / 24 over an arc about it, to the
-    fourth power of the arc: 2e-4 px of 100 px for a step of 15 deg. A row that is read when
-    the stage has turned on by t shows p + p' t + p'' t^2 / 2 + p''' t^3 / 6, to the fourth
-    power of t: 5e-4 px of 100 px for 6 deg.
+    A path p of the angle has the mean p + p'' arc^2 / 24 over an arc (2e-4 px of 100 px
+    off for 15 deg). A row read when the stage has turned on by t shows p + p' t + p'' t^2
+    / 2 + p''' t^3 / 6 (5e-4 px of 100 px off for 6 deg).
 
     Args:
-        poses: nominal geometry of the n frames.
-        beads: (k, 3) centers [mm].
         base: (groups, 28) values of PARAMETERS, internal units, in the reading.
-        group: (n,) of each frame.
-        reading: of eq. 5.4.
-        places: (n, k) row of each position, from the panel's middle, in panel heights.
+        places: (n, k) rows from the panel's middle, in panel heights.
 
     Returns:
-        (n, k, 2, 1 + ROWS_POWERS) [px], of the exposure and of the powers of the rows' share
-        of a step; 0 in groups of one frame.
+        (n, k, 2, 1 + ROWS_POWERS) [px], of the exposure and of the rows' powers; 0 in
+            groups of one frame.
     """
     out = np.zeros((len(poses), len(beads), 2, 1 + ROWS_POWERS))
     for g, row in enumerate(base):
@@ -935,11 +918,7 @@ def frame_shapes(shape: Shape, frames: int) -> FloatArray:
 
 
 def as_poses(geometry: Poses | ConeVec) -> Poses:
-    """Return the poses of a nominal geometry.
-
-    Raises:
-        GeometryError: `Poses.from_cone_vec` cannot read the stage angles from the rows.
-    """
+    """Return the poses of a geometry; GeometryError if rows tell no angles."""
     if isinstance(geometry, Poses):
         return geometry
     return Poses.from_cone_vec(geometry)
@@ -1031,10 +1010,7 @@ def from_printed_reading(p: Offsets, reading: Reading) -> Offsets:
 
 
 def edge_factor(column: str) -> float:
-    """Return the edge units per internal unit of a column: deg per rad for angles, else
-    1, also for columns that are no parameters; of a group's column (NAME@NUMBER) as of
-    the parameter.
-    """
+    """Return the edge units per internal unit of a column: deg per rad, else 1."""
     name = column.split("@")[0]
     if name in NAMES:
         return to_edge(name, 1.0)

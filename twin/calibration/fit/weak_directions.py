@@ -158,14 +158,7 @@ def advise(names: Sequence[str], beads: int) -> str:
 def null_directions(
     basis: FloatArray, scale: FloatArray, names: Sequence[str], beads: int
 ) -> tuple[Direction, ...]:
-    """Name the null space.
-
-    Args:
-        basis: (columns, r) orthonormal null vectors of the column-scaled Jacobian.
-        scale: (columns,) column norms per edge unit: change = basis / scale.
-        names: of the columns.
-        beads: beads seen.
-    """
+    """Name the null space, spanned by `basis` (columns, r) of scaled columns."""
     return tuple(
         weak_direction(vector, scale, names, np.inf, beads) for vector in _sparse(basis).T
     )
@@ -176,20 +169,18 @@ def weak_direction(
 ) -> Direction:
     """Name one direction of the column-scaled parameter space.
 
-    Columns below a tenth of the largest share are left out. The column that is most
-    uncertain relative to its tolerance comes first, with factor 1; each other factor is
-    that column's change relative to the first.
+    Columns below a tenth of the largest share are left out. The one most uncertain
+    relative to its tolerance leads, with factor 1; other factors are changes relative to
+    it.
 
     Args:
         vector: (columns,) direction.
         scale: (columns,) column norms per edge unit: change = vector * sigma / scale.
-        names: of the columns.
         sigma: along the vector, scaled units; inf where it is not determined.
         beads: number of beads seen, from which the advice follows.
 
     Returns:
-        With its sigma in the lead's edge unit (inf where it is not determined) and advice
-        on data that would determine it.
+        With sigma in the lead's edge unit, and advice.
     """
     order = np.argsort(-np.abs(vector))
     involved = [int(i) for i in order if abs(vector[i]) > 0.1 * abs(vector[order[0]])]

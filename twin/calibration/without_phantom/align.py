@@ -56,11 +56,9 @@ def _or_refused(find: Callable[P, Alignment]) -> Callable[P, Alignment]:
 
     @wraps(find)
     def found(*args: P.args, **options: P.kwargs) -> Alignment:
-        """Call `find`; where it raises NotIdentifiableError, return an alignment that
-        refuses every parameter for that reason.
+        """Call `find`; where it raises NotIdentifiableError, refuse every parameter.
 
-        The refused parameters are axis_column_px, det_roll, det_yaw, source_row_px and
-        those of UNTOLD, which keep their own reasons; offsets are None and frames 0.
+        All but those of UNTOLD have its reason; offsets are None and frames 0.
         """
         try:
             return find(*args, **options)
@@ -180,10 +178,9 @@ def _motion(
 ) -> Motion:
     """Find the shifts of single frames as a motion of the sample.
 
-    `planes`: pairs of the turn's frames; `turn`: its frames; `corrected`: offsets that are known
-    by then; `random`: for the image of noise.
-    Raises NotIdentifiableError: frames are repeated, too many, or the images do not determine
-    shifts."""
+    `corrected`: known offsets; `random`: for noise. Raises NotIdentifiableError: frames
+    repeat, or shifts are not determined.
+    """
     if turn.repeated:
         raise NotIdentifiableError(
             f"frames {list(turn.repeated)} repeat the one before: from there on "

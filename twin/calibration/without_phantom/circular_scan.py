@@ -61,11 +61,8 @@ class CircularScan:
         base: Offsets,
         priors: Mapping[str, float],
     ) -> CircularScan:
-        """Check that the frames that are present form one circle, and make the scan.
-
-        Raises:
-            NotIdentifiableError: no frame is present, or source or panel move by more
-                than `STANDS`.
+        """Make the scan; NotIdentifiableError if no frame is there, or source or panel
+        move.
         """
         refuse_if(len(present) == 0, "no frame is there")
         return cls(image, poses, present, shape, base, priors, _standing(poses, present))
@@ -104,11 +101,9 @@ class CircularScan:
         return float(shown.project_points(level, self.shape)[0, 0, 1])
 
     def slopes(self, values: FloatArray, scales: FloatArray) -> FloatArray:
-        """Compute the change of the axis' column with each parameter, by central differences of
-        a tenth of a step to each side.
+        """Compute the axis column's change with each of (k,) parameters [px per unit].
 
-        `values`: (k,) parameters; `scales`: (k,) their steps.
-        Returns (k,) [px per unit of the parameter].
+        By differences of a tenth of a step (`scales`) to each side.
         """
         steps = np.diag(0.1 * scales)
         return np.array(

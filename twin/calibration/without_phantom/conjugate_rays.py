@@ -129,18 +129,12 @@ class Profile:
         sigma: FloatArray,
         soft: float,
     ) -> Profile:
-        """Make a profile that looks for steps at all columns but those of the last bin, and
-        is certain of them but for the last `BEYOND` bins: with one bin beyond, a wall that
-        turns back there looks the same.
+        """Make a profile of (k,) columns' radii [px], and of bins' shifts (m,) [px].
 
-        Args:
-            radius: of columns from the axis, (k,) [px].
-            weight: their information, (k,).
-            place: their bins, (k,).
-            shift, sigma: of the bins, (m,) [px].
-            soft: sigma of the smoothing [px].
+        It is certain of steps but for the last `BEYOND` bins.
         """
         at = radius[place < place.max()]
+        # With one bin beyond, a wall that turns back there looks like a step.
         certain = int((place <= place.max() - BEYOND).sum())
         return cls(at, _basis(radius, weight, place, at, soft), shift, sigma, certain)
 
@@ -179,10 +173,9 @@ class Profile:
         return max(found, key=lambda one: abs(one.width) / one.least)
 
     def at(self, radius: float) -> Step:
-        """Estimate the step at the radius next to one beside the axis; its sigma and least are
-        inf unless the innermost bin is inside it.
+        """Estimate the step near a radius [px] from the axis.
 
-        `radius`: distance from the axis [px].
+        Sigma and least are inf unless the innermost bin is inside it.
         """
         place = self._place(radius, self.certain)
         step = self.at_certain(radius)
@@ -195,12 +188,7 @@ class Profile:
         return self._at(self._place(radius, self.certain))
 
     def at_rim(self, radius: float) -> Step:
-        """Estimate the step at the radius next to one, also with one bin beyond; a wall that
-        turns back there looks the same.
-
-        Args:
-            radius: distance from the axis [px].
-        """
+        """Estimate the step near a radius [px], also with one bin beyond."""
         return self._at(self._place(radius, len(self.radii)))
 
     @property
@@ -286,11 +274,10 @@ class Profile:
 
 
 def _spread(widths: FloatArray, rest: FloatArray, usable: npt.NDArray[np.bool_]) -> float:
-    """Compute the standard deviation of widths over radii, weighted by how well they explain
-    shifts: exp of half the chi square lost to the best.
+    """Compute the standard deviation of widths (r,) [px] over radii, by their likelihood.
 
-    `widths`: of steps at the radii, (r,) [px]. `rest`: residuals of each in sigmas, (r, m).
-    `usable`: whether a radius counts, (r,); one at least. Returns [px]."""
+    `rest`: residuals of each in sigmas, (r, m); `usable`: radii that count, one at least.
+    """
     chi_square = np.square(rest).sum(axis=1)
     less = np.minimum(chi_square[usable].min() - chi_square, 0.0)
     likely = usable * np.exp(less / 2.0)
@@ -305,12 +292,11 @@ def _basis(
     at: FloatArray,
     soft: float,
 ) -> FloatArray:
-    """Compute the shares of a common shift, a yaw (`YAW_PX` at the outermost column, growing as
-    the square) and of steps at radii in each bin, as weighted means of its columns.
+    """Compute each bin's shares of a common shift, a yaw and steps at radii, (r, m, 3).
 
-    `radius`: of columns from the axis, (k,) [px]; `weight`: their information, (k,); `place`:
-    their bins, (k,); `at`: the radii (r,) [px]; `soft`: sigma of the smoothing [px].
-    Returns (r, m, 3).
+    Shares are means weighted by columns' information; the yaw is `YAW_PX` at the last,
+    growing as the square. `place`: the columns' bins; `at`: radii (r,) [px]; `soft`:
+    smoothing's sigma [px].
     """
     one_of = (place == np.arange(place.max() + 1)[:, None]) * weight
     one_of /= one_of.sum(axis=1, keepdims=True)
@@ -395,13 +381,12 @@ class ConjugateRays:
         return float(self.rows.mean())
 
     def column(self, values: FloatArray) -> tuple[FloatArray, float]:
-        """Move the first of the parameters of the plane until both ends of rays agree, in up to
-        `ROUNDS` steps; from a coarser smoothing (`COARSE`) where the fine one shows no
-        agreement.
+        """Move the plane's first parameter until both ends of rays agree, in `ROUNDS`
+        steps.
 
-        `values`: parameters in the order of `circular_scan.FREE`, (k,); not changed.
-        Returns the parameters, and the standard deviation of the column by sectors [px]; inf if
-        too little turns (`MIN_CORRELATION`), with the parameters of the last step.
+        From coarser smoothing (`COARSE`) where the fine shows no agreement. Returns
+        parameters (k,), and the column's standard deviation [px]; inf if too little turns
+        (`MIN_CORRELATION`).
         """
         fine, sigma = self._agreement(values)
         if math.isfinite(sigma):

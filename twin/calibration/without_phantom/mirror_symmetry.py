@@ -79,12 +79,7 @@ def mirror_map(view: FloatArray) -> FloatArray:
 
 
 def border_room(cols: int) -> float:
-    """Return the distance from a tile's border, at the finest smoothing, up to which pixels do
-    not count in the fit [px].
-
-    Args:
-        cols: of the panel.
-    """
+    """Return the distance from a tile's border where pixels do not count [px]."""
     return _room(max(cols / LEVELS[-1], 1.0))
 
 
@@ -128,15 +123,10 @@ def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
 
 
 def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
-    """Find the least cost, and the ratio of the next local minimum's cost to it.
+    """Find the least cost (inf: not tried), and the next minimum's over it.
 
-    Args:
-        cost: (n,) costs of equally spaced trials; inf: not tried.
-        apart: least distance between two minima, in trials.
-
-    Returns:
-        Index of the least cost, and the ratio, of minima more than `apart` away: inf
-        without another, 0 if the least cost is at an end or next to one that was not tried.
+    Minima are more than `apart` trials away. The ratio is inf without another, 0 if the
+    least cost is at an end or next to one that was not tried.
     """
     best = int(cost.argmin())
     inner, made = cost[1:-1], np.isfinite(cost)
@@ -157,16 +147,13 @@ def find_symmetry(
     border: int | None = None,
     held_px: float | None = None,
 ) -> Symmetry:
-    """Estimate the plane of symmetry from coarse to fine smoothings (LEVELS), each from the last
-    one's values; without a border the search ends at the first that does not converge.
+    """Estimate the plane of symmetry from coarse to fine smoothings (LEVELS).
 
-    `turn`: the frames' mean; `view`: parameters to a view; `start`: of the parameters, (k,);
-    `scales`: change of each parameter that moves the image's ends by about a pixel, (k,);
-    `priors`: sigma of each parameter about its start, inf for none, (k,); `border`: first column
-    beyond a gap between two tiles, whose width is the last parameter [px]; `held_px`: that
-    width, where it is no parameter [px].
-    Returns the estimate of the level that determines the first two parameters best among the
-    converged ones; the coarsest, not converged, if none did.
+    Each starts at the last; without a border the search ends where one does not converge.
+    `scales`: change of each parameter (k,) that moves the image's ends by about a pixel;
+    `priors`: sigmas, inf for none; `border`: first column beyond a gap, whose width [px]
+    is the last parameter unless `held_px`. Returns the converged level that determines
+    the first two parameters best; else the coarsest.
     """
     found = []
     values = start
@@ -432,10 +419,10 @@ class _MirrorPairs:
         return rest, max(float(np.average(white, weights=self.w)), 1e-30)
 
     def _copies_power(self) -> float:
-        """Compute the weighted mean square by which mirrored pairs of the scan's own copies
-        differ: of every second frame less those between, and of frames that are missing or
-        repeated (`Turn.doubts`). They have the asymmetry of too few views, of noise and of
-        flicker, and none of a mean that is not symmetric."""
+        """Compute the weighted mean square of the scan's own copies' mirrored pairs.
+
+        It has the asymmetry of few views, noise and flicker, no other.
+        """
         total = 0.0
         for copy in range(1, len(self.own)):
             squares = np.square(self._rest(copy))
@@ -544,12 +531,9 @@ def _noise(mean: FloatArray) -> FloatArray:
 
 
 def _steps(mean: FloatArray, noise: FloatArray) -> FloatArray:
-    """Estimate the standard deviation of sampling errors at edges along the rows, (rows, cols).
-
-    Pixels that are points know an edge between two of them to half a row; blur and a
-    pixel's size spread it over several. An edge without blur has all frequencies alike,
-    so their attenuation at half the sampling's, relative to a quarter, gives the
-    attenuation at the sampling's own."""
+    """Estimate sigmas of sampling errors at edges along rows, (rows, cols)."""
+    # Pixels that are points know an edge to half a row. Without blur it has all frequencies
+    # alike: the attenuation at half the sampling's, relative to a quarter, gives its own.
     edges, left = _edges(mean, noise)
     return np.asarray(edges * left**2 / math.sqrt(6.0))
 

@@ -146,12 +146,11 @@ class OppositeRays:
         return tried[best], ratio
 
     def find(self, values: FloatArray) -> Symmetry:
-        """Estimate the parameters from coarse to fine images, each from the last converged
-        values.
+        """Estimate the parameters (k,) from coarse to fine, each from the last converged.
 
-        `values`: (k,) to start from.
-        Returns the level with the least sigma of the first parameter among those that converged;
-        the first, not converged, if none did."""
+        Returns the level with the least sigma of the first among the converged; else the
+        first, not converged.
+        """
         found = []
         for part in LEVELS:
             found.append(_Level(self, max(self.shape[1] / part, 1.0)).solve(values))
@@ -214,12 +213,10 @@ class _Level:
     def read(
         self, image: FloatArray, places: FloatArray, pairs: npt.NDArray[np.intp]
     ) -> FloatArray:
-        """Read the values of both views of pairs by cubic splines; rows off the band take its
-        edge.
+        """Read values of both views of pairs (q, 2) by cubic splines, (2, q, lifts).
 
-        `image`: spline coefficients of all views, one above the other; `places`: (side, column
-        and row, q) [px of the panel]; `pairs`: (q, 2) numbers of the views.
-        Returns (2, q, lifts) line integrals, `lifts` rows higher or lower.
+        Rows off the band take its edge; `lifts` are rows higher. `image`: coefficients,
+        views one above the other; `places`: (side, column and row, q) [px].
         """
         rows = self.rays.frames.shape[1]
         row = places[:, 1, :, None] + self.rays.lifts - self.rays.top
@@ -347,15 +344,13 @@ class _Level:
         pairs: npt.NDArray[np.intp],
         values: FloatArray,
     ) -> float:
-        """Bound the sum of slopes times differences that are no noise: in phase within a patch
-        (Cauchy-Schwarz), at random from patch to patch.
+        """Bound the sum of slopes times differences that are no noise.
 
-        A patch is `PATCH` sigmas of the distance between both columns by one of `SECTORS`
-        sectors.
-        `slope`: of the differences with the column, (m,). `excess`: squares of the differences
-        less those of noise, (m,). Noise alone gives as many patches too little as too much, so
-        negative ones count as such. `w`: weights, (m,). `pairs`: of views, (q, 2). `values`:
-        parameters, (k,)."""
+        In phase within a patch (Cauchy-Schwarz), at random between them; a patch is
+        `PATCH` sigmas of both columns' distance by a sector.
+        `excess`: squares of differences less noise's, (m,); noise alone gives as many
+        negative.
+        """
         column = self.rays._places(values, pairs)[0][:, 0]
         near = ((column[0] - column[1]) / (PATCH * self.sigma)).astype(np.intp)
         sector = pairs[:, 0] * SECTORS // len(self.rays.frames)

@@ -211,11 +211,9 @@ class PlanePairs:
         return np.hstack([pairs, blocks.reshape(len(LEVELS), -1)])
 
     def _own(self, rest: FloatArray) -> FloatArray:
-        """Subtract from differences of pairs, (q, k), the mean over all pairs as far apart.
+        """Subtract from pairs' differences (q, k) the mean over all pairs as far apart.
 
-        A pattern that stays on the panel, such as the noise of the one flat image, is the
-        same in all of them and no average lessens it. A turn's mean is a body of
-        revolution, whose planes agree at any height: what is lost says nothing of it.
+        It is what stays on the panel; planes of a body of revolution have none.
         """
         total = np.add.reduceat(rest * self.valid, self.starts, axis=0)
         count = np.add.reduceat(self.valid, self.starts, axis=0, dtype=np.intp)
@@ -267,11 +265,7 @@ class PlanePairs:
         return np.asarray(np.sqrt(worst))
 
     def noise(self, random: np.random.Generator) -> Float32Array:
-        """Draw images of noise as large as that of the frames, summed down their columns like
-        `sums`, (n, cols, rows + 1).
-
-        `random`: generator, advanced.
-        """
+        """Draw images of noise like the frames', summed down columns as `sums`."""
         out = np.zeros_like(self.sums)
         np.cumsum(
             noise_like(np.diff(self.sums, axis=2), random), axis=2, out=out[:, :, 1:]
@@ -328,10 +322,11 @@ def _widened(of_bins: FloatArray | npt.NDArray[np.bool_], bins: int) -> FloatArr
 
 
 def noise_like(images: Float32Array, random: np.random.Generator) -> Float32Array:
-    """Draw noise as large as that of images. Its variance grows as 1 / exp(-g), as that of
-    counted photons, up to `DARKEST`; its size is the median over all pixels of second
-    differences along the second axis, so mostly of air. `images`: line integrals (n, cols,
-    rows); `random`: generator, advanced. Returns new images of that shape."""
+    """Draw noise as large as that of line integrals (n, cols, rows).
+
+    Its variance grows as exp(g), as of counted photons, up to `DARKEST`; its size is the
+    median of second differences along the columns, so mostly of air.
+    """
     power = np.exp(np.minimum(images, DARKEST))
     change = np.square(np.diff(images, 2, axis=1)) / 6
     size = math.sqrt(float(np.median(change / power[:, 1:-1])) / MEDIAN_OF_CHI_SQUARE)

@@ -251,18 +251,10 @@ def _first_in_turn(scan: CircularScan, turn: Turn) -> FirstColumn:
 def _first_in_rays(
     scan: CircularScan, no_turn: str, random: np.random.Generator
 ) -> FirstColumn:
-    """Search for the axis in opposite rays.
+    """Search for the axis in opposite rays, with all five parameters of `FREE`.
 
-    Roll, yaw and the distances have the given priors; the axis column has none. The
-    roll's scale is that of the columns.
-
-    Args:
-        scan: to align.
-        no_turn: why there is no turn; the messages of errors begin with it.
-        random: for images of noise.
-
-    Returns:
-        With all five parameters of `FREE`.
+    All but the axis column have priors. `no_turn`: why there is no turn; errors begin
+    with it.
 
     Raises:
         NotIdentifiableError: hardly two views see a line from both ends.
@@ -312,12 +304,11 @@ def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
 
 
 def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFound:
-    """Look for a gap between two panel tiles that the known panel does not close already.
+    """Look for a gap between two panel tiles that the known panel does not close.
 
-    `scan`: to align. `first`: the axis, and the turn. `panel`: known distortion; None: none.
-    Returns nothing found without a full turn, or where the machine's file says that the panel is
-    in one piece (`gap = 0` in its priors).
-    Raises NotIdentifiableError: there are two gaps."""
+    Nothing without a full turn, or where the machine states none (`gap = 0`). Raises
+    NotIdentifiableError: there are two.
+    """
     if first.turn is None or scan.priors.get("gap") == 0.0:
         return GapFound(None, None)
     borders = panel.model.borders if panel else ()
@@ -327,9 +318,9 @@ def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFoun
 
 
 def _closes(found: Symmetry, gap: Gap) -> bool:
-    """Check whether the fit shows that there is no gap: it converged, determines the
-    width at least twice as well as its prior, and leaves no width above `SIGMAS`; False
-    if the gap is beside the axis.
+    """Check whether a converged fit shows that there is no gap (its width is 0).
+
+    It is known twice as well as by its prior; False beside the axis.
     """
     if gap.beside_axis:
         return False
@@ -339,14 +330,10 @@ def _closes(found: Symmetry, gap: Gap) -> bool:
 
 
 def _with_gap(first: FirstColumn, gap: Gap, behind: FloatArray | None) -> FirstColumn:
-    """Start at the plane with the gap between two panel tiles closed: the mean's own axis is off
-    by half of its width.
+    """Start at the plane with the gap closed: the mean's axis is off by half its width.
 
-    The width becomes the last parameter, with its prior; not if the gap lies beside the axis,
-    where the plane does not determine it. Errors begin with the gap's text.
-
-    `first`: the start without a gap. `gap`: its column and width. `behind`: parameters of the
-    plane with it closed; None: those of `first`.
+    The width becomes the last parameter, but not beside the axis, where the plane does
+    not tell it. `behind`: parameters with it closed; None: the first's.
     """
     values = first.values if behind is None else behind
     if gap.beside_axis:
@@ -482,10 +469,11 @@ def _plane(
 def _gap_of_fit(
     gap: Gap, found: Symmetry, widths: Sequence[tuple[float, float]]
 ) -> tuple[Gap, float]:
-    """Give a gap the width that was fitted. `gap`: as it was found; `found`: the plane, with the
-    gap's width as the last parameter [px]; `widths`: by other means, with their standard
-    deviations [px]. Returns the gap, its sigma raised as far as the other widths contradict it,
-    and what that adds to the sigma of the axis column [px]."""
+    """Give a gap the fitted width, the plane's last parameter [px].
+
+    Its sigma rises as far as the other `widths` contradict it. Returns also what that
+    adds to the sigma of the axis column [px].
+    """
     sigma = float(np.sqrt(found.covariance[-1, -1]))
     fitted = gap._replace(width=float(found.values[-1]), sigma=sigma)
     raised = contradicted(fitted, widths)
@@ -531,14 +519,7 @@ def _closed(scan: CircularScan, turn: Turn, gap: Gap) -> tuple[CircularScan, Tur
 
 
 def _beside_rows(scan: CircularScan, rays: OppositeRays, roll_rad: float) -> float:
-    """Compute the motion of the axis in the panel's middle row by the roll's uncertainty,
-    as other rows were read [px]; 0 if one (averaged) row was.
-
-    Args:
-        scan: gives the number of rows.
-        rays: with the rows read.
-        roll_rad: standard deviation of the roll [rad].
-    """
+    """Compute the axis' motion [px] from the rows read to the middle one by the roll."""
     read = rays.frames.shape[1]
     return float(roll_rad * (rays.top - (scan.shape[0] - read) / 2) * (read > 1))
 
@@ -546,9 +527,8 @@ def _beside_rows(scan: CircularScan, rays: OppositeRays, roll_rad: float) -> flo
 def _keep_roll(
     values: FloatArray, covariance: FloatArray, roll_rad: float, sigma_rad: float
 ) -> None:
-    """Replace, in place, the roll's value and variance by those in force, and its covariances by
-    0: few rows gave values up to six sigma off. `values`: (k,), the roll second; `covariance`:
-    (k, k); `roll_rad` and `sigma_rad`: in force [rad]."""
+    """Put the roll in force, value and sigma, in place of the fitted one, in place."""
+    # Few rows gave values up to six sigma off.
     values[1] = roll_rad
     covariance[1] = 0.0
     covariance[:, 1] = 0.0

@@ -174,13 +174,11 @@ def read_turn(
 
 
 def _groups(rows: int, cols: int, middle: float) -> list[tuple[int, int]]:
-    """Divide the rows about `middle`, where the plane of the source meets the panel, into at
-    most `GROUPS` groups.
+    """Divide the rows about `middle`, where the source's plane meets the panel, into
+    groups.
 
-    `BAND` rows or a `BAND_PART` of the columns on either side are used, moved inwards at the
-    panel's edges.
-    `rows` and `cols`: of the panel; `middle`: row [px].
-    Returns (top, end) of each, of a row at least.
+    There are `GROUPS` at most, of `BAND` rows or a `BAND_PART` of the columns on either
+    side, moved inwards at edges. Returns (top, end) of each.
     """
     half = max(BAND, cols // BAND_PART)
     centre = min(

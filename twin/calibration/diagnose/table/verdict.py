@@ -237,14 +237,11 @@ def _misfits(what: Explained, sigmas_known: bool, misfit_px: float) -> bool:
 
 
 def largest_residual(fit: FitResult, chance: float, sigmas_known: bool = False) -> float:
-    """Compute the root mean square residual that a right fit exceeds by chance.
+    """Compute the rms residual [px] that a right fit exceeds with a probability `chance`.
 
-    Positions scatter by their stated sigmas and, from image to image, by
-    `certificate.POSITION_SPREAD_PX` with SPREAD_FREEDOM degrees of freedom.
-    `fit`: whose residuals are judged. `chance`: probability of more. `sigmas_known`: the
-    positions' sigmas were measured, and are no more than compared; else the stated ones are
-    ignored.
-    Returns [px]."""
+    Positions scatter by their sigmas (ignored unless `sigmas_known`, measured) and, from
+    image to image, by `POSITION_SPREAD_PX`.
+    """
     usual = SPREAD_FREEDOM / float(chdtri(SPREAD_FREEDOM, 1.0 - chance))
     certificate = fit.certificate
     measured = sigmas_known and certificate.noise > 0.0

@@ -79,13 +79,7 @@ class Evidence:
         width: FloatArray | float = 0.0,
         free: FloatArray | None = None,
     ) -> Evidence:
-        """Add log likelihoods (w, c) of other data.
-
-        Args:
-            more: of a gap over none.
-            width: of the widths of a gap; 0: the data do not determine them.
-            free: of a gap over none, without what else looks like one; None: `more`.
-        """
+        """Add log likelihoods (w, c) of other data; `free`: less what resembles a gap."""
         both = more if free is None else free
         return Evidence(self.found + more, self.width + width, self.free + both)
 
@@ -243,9 +237,10 @@ def frame_evidence(images: FloatArray) -> Evidence:
 
 
 def _about_borders(table: FloatArray, gap: int) -> FloatArray:
-    """Give the differences of neighboring columns about each border, with the columns left out
-    that a gap there would hide. `table`: rows of frames, (m, c + 2 SIDE - 1); `gap`: number of
-    columns. Returns (m, c - gap, 2 SIDE - 1)."""
+    """Return differences of neighboring columns about borders, (m, c - gap, 2 SIDE - 1).
+
+    `gap` columns, which a gap there would hide, are left out.
+    """
     border = np.arange(SIDE, table.shape[1] - SIDE + 1 - gap)
     beside = np.arange(2 * SIDE)
     columns = border[:, None] + beside - SIDE + gap * (beside >= SIDE)
@@ -253,10 +248,10 @@ def _about_borders(table: FloatArray, gap: int) -> FloatArray:
 
 
 def _is_smooth(here: Differences) -> npt.NDArray[np.bool_]:
-    """Mark all places but those that change most from one side of the border to the other, as
-    many as there are places with most change. What both sides have in common, and the step
-    across the border, are not looked at: noise and a gap in them are the same in the places that
-    are left. Returns (m, c)."""
+    """Mark (m, c) all but the places that change most across the border.
+
+    What both sides share does not count: noise and gaps stay the same in the places left.
+    """
     around = here.around
     apart = around[:, :, SIDE:] - around[:, :, SIDE - 2 :: -1]
     change = np.square(apart).sum(axis=2)
@@ -373,14 +368,7 @@ def _found(gain: Gain, shown: FloatArray) -> FloatArray:
 
 
 def _trust(gain: Gain, shown: FloatArray, passed: FloatArray) -> float:
-    """Compute the part of a gain that its scatter justifies: where the model fits, its
-    variance is what a gap adds to it.
-
-    Args:
-        gain: of gaps of a width.
-        shown: excess behind such a gap, (c,).
-        passed: differences that count at each border, (c,).
-    """
+    """Compute the part of a gain that the scatter `shown` (c,) behind it justifies."""
     return min(float(np.median((shown / gain.spread)[passed > 0.0])), 1.0)
 
 
@@ -394,10 +382,10 @@ def log_student(deviation: FloatArray) -> FloatArray:
 def evidence_of_widths(
     width: FloatArray, sigma: FloatArray, share: float = 0.0
 ) -> FloatArray:
-    """Compute log likelihood ratios of a gap of each width to none from a measured width
-    (Student). `width`: measured at each column, (c,) [px]; `sigma`: standard deviation of each
-    where there is no gap, (c,) [px]; `share`: standard deviation that a gap adds, as a share of
-    its width. Returns (w, c)."""
+    """Compute log likelihood ratios (w, c) of gaps of each width to none (Student).
+
+    From widths [px] measured at c columns; `share`: sigma that a gap adds, per width.
+    """
     of_gap = np.hypot(sigma, share * WIDTHS_PX[:, None])
     left = (width - WIDTHS_PX[:, None]) / of_gap
     none = log_student(width / sigma) - np.log(sigma)

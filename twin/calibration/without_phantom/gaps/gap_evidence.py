@@ -157,9 +157,10 @@ def _from_axis(gap: Gap, axis: float) -> float:
 
 
 def contradicted(gap: Gap, widths: Sequence[tuple[float, float]]) -> Gap:
-    """Raise the sigma of a gap's width as far as other measurements contradict it. Few distances
-    from the axis, or few places of the mean, are less sure than they say. `gap`: by rays, by
-    frames or by the symmetry of the mean; `widths`: each with its standard deviation [px]."""
+    """Raise the sigma of a gap's width as far as other measurements contradict it.
+
+    `widths`: each with its standard deviation [px].
+    """
     apart = [
         abs(gap.width - width) / math.hypot(gap.sigma, sigma) for width, sigma in widths
     ]
@@ -213,15 +214,7 @@ def _measured(
 
 
 def _far_from(gap: Gap, seen: Sequence[Gap], about: float, axis: float) -> list[Gap]:
-    """Select the gaps that are as far from the axis as another one on neither side: rays see
-    the difference of two such, what is left of the other's width.
-
-    Args:
-        gap: that other one.
-        seen: gaps that single frames show.
-        about: least difference of the distances [px].
-        axis: its column [px].
-    """
+    """Select gaps not as far (by `about` px) from the axis as another."""
     own = _from_axis(gap, axis)
     return [one for one in seen if abs(_from_axis(one, axis) - own) > about]
 

@@ -124,11 +124,8 @@ def _usual_line(power: FloatArray, excess: FloatArray) -> UsualLine:
 
 
 def scatter_of_sums(values: FloatArray) -> FloatArray:
-    """Compute the standard deviation of sums over frames, (c,), from those of blocks of
-    `BLOCK_FRAMES` neighbors: frames beside each other show the same edges.
-
-    Args:
-        values: (n, c) of n frames.
+    """Compute the sigma of sums over frames, (c,), from blocks of neighbors, which are
+    alike.
     """
     blocks = np.add.reduceat(values, np.arange(0, len(values), BLOCK_FRAMES), axis=0)
     return np.asarray(np.sqrt(np.square(blocks).sum(axis=0)))

@@ -195,11 +195,10 @@ def hidden_gap(
 def _judged_about(
     stack: FloatArray, middle: float, reach: float
 ) -> tuple[npt.NDArray[np.intp], Evidence] | None:
-    """Judge the borders about a column by single frames.
+    """Judge the borders within `reach` [px] of a column by single frames (n, rows, cols).
 
-    `stack`: line integrals, (n, rows, cols); `middle`: column; `reach`: distance from it up to
-    which borders are judged, LEAST_COLUMNS at least [px].
-    Returns first columns beyond the borders, (c,), and their evidence; None for too few columns.
+    Returns first columns beyond the borders, (c,), and their evidence; None for too few
+    columns.
     """
     half = max(float(LEAST_COLUMNS), reach) + SIDE
     low = math.floor(max(middle - half, 0.0))
@@ -210,15 +209,12 @@ def _judged_about(
 
 
 def frames_show(frames: Sequence[Float32Array], gap: Gap, about: float) -> bool:
-    """Check whether single frames leave a gap that both ends of rays show its odds of
-    `REPORTED_ODDS`.
+    """Check whether single frames leave a gap, seen by rays, odds of `REPORTED_ODDS`.
 
-    Where both ends of rays differ by what is smooth in the columns (hardening, an object that is
-    not symmetric), a step passes for a gap, by `FOOLED_CHANCE`; frames do not show one.
-
-    `frames`: line integrals of `tile_gap.averaged_rows`, some of a turn; `gap`: by both ends of
-    rays; `about`: distance from its column within which frames may show it [px].
-    Returns also True where the images have too few columns about the gap to judge it.
+    In rays what is smooth in the columns (hardening, an asymmetric object) passes for a
+    gap (`FOOLED_CHANCE`), not in frames.
+    `frames`: some of a turn, of `tile_gap.averaged_rows`; `about`: distance within which
+    they may show it [px]. Returns True, too, where columns are too few.
     """
     stack = np.asarray(frames, dtype=np.float64)
     judged = _judged_about(stack, gap.column, 0.0)
@@ -270,10 +266,11 @@ def _hidden_radius(profile: Profile, smoothing: float) -> float:
 
 
 def _of_outlines(found: FloatArray, beside: FloatArray) -> FloatArray:
-    """Compute the evidence that outlines leave, where edges turn back at both sides of the axis:
-    the largest about the mirrored border, 0 or more. `found`: logarithm of the likelihood of a
-    gap over none, (w, c); `beside`: of each border from the axis, even steps of a column, (c,)
-    [px]. Returns (w, c); 0 for borders within `SIDE` of the axis or without a mirrored one."""
+    """Compute the evidence that outlines leave, turning back at both sides of the axis.
+
+    It is the largest of `found` (w, c) about the mirrored border, 0 or more; 0 within
+    `SIDE` of the axis. `beside`: borders from the axis, (c,) [px].
+    """
     places = np.arange(len(beside))
     mirror = np.rint(-2.0 * beside).astype(np.intp) + places
     known = (np.abs(beside) > SIDE) & (mirror >= 0) & (mirror < len(places))
@@ -318,16 +315,10 @@ def _of_modes(columns: npt.NDArray[np.intp], steps: ModeSteps) -> FloatArray:
 
 
 def _is_excluded(effect: FloatArray, smoothing: float) -> bool:
-    """Check whether the images have odds of `REPORTED_ODDS` against a gap in each stretch of
-    as many columns as rays hide about any axis.
+    """Check whether each stretch of columns that rays hide has odds against a gap.
 
-    Tiles may meet in any of them: many columns that exclude a gap say nothing about those
-    that do not. How rare gaps are (`CHANCE`) says nothing about this panel.
-
-    Args:
-        effect: likelihood of a gap over none at each column, gaps weighted by how far they
-            move the axis (`Evidence.effect`), (c,); one at least.
-        smoothing: of the rays' profile [px].
+    Many columns that exclude one say nothing about others.
+    `effect`: likelihoods (`Evidence.effect`), (c,); `smoothing` [px].
     """
     stretch = min(1 + math.floor(2.0 * HIDDEN_SIGMAS * smoothing), len(effect))
     of_stretches = np.convolve(effect, np.full(stretch, 1.0 / stretch), mode="valid")
@@ -363,10 +354,11 @@ def _beside_told(
 def _shown_at_rim(
     of_mean: MirrorSteps, axis: float, profile: Profile
 ) -> npt.NDArray[np.intp]:
-    """Find the columns beyond the last distance at which both ends of rays are certain of a
-    step, where they and the mean show one by `REPORTED_ODDS`. Others there are nobody's: hardly
-    anything turns beyond them. `of_mean`: evidence of the mean; `axis`: its column [px];
-    `profile`: steps that rays show. Returns (c,) first columns beyond a gap, perhaps none."""
+    """Find columns (c,) beyond the last certain distance with a gap by `REPORTED_ODDS`.
+
+    Rays and the mean (`of_mean`) count together. Others there stay open: hardly anything
+    turns beyond them.
+    """
     columns = np.arange(of_mean.found.shape[1])
     columns = columns[np.abs(columns - 0.5 - axis) > profile.last]
     of_rays = trusted(_evidence_of_rays(columns, axis, profile))

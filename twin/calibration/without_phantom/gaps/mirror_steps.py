@@ -315,15 +315,7 @@ def _of_bands(values: FloatArray, radii: int) -> FloatArray:
 def _is_steep(
     slope: FloatArray, weight: FloatArray, scale: float, across: float
 ) -> npt.NDArray[np.bool_]:
-    """Mark places whose slopes are above those of smoothed noise, which are smaller than the
-    sigma of differences by the root of 8 sigmas of the smoothing.
-
-    Args:
-        slope: (m,).
-        weight: (m,).
-        scale: variance of weighted differences by noise.
-        across: sigma of the smoothing across the columns [px].
-    """
+    """Mark slopes above those of smoothed noise, sigma / sqrt(8 `across`^2)."""
     least = MIN_EDGE_SIGMAS**2 * scale / (8.0 * across**2)
     return np.asarray(np.square(slope) * weight > least)
 
@@ -395,10 +387,10 @@ def _ratios(radius: FloatArray, squares: FloatArray, border: FloatArray) -> Floa
 
 
 def _least(inside: FloatArray, beyond: FloatArray, step: int) -> FloatArray:
-    """Find the least sums of squares over common displacements, with a step.
+    """Find the least sums of squares over common displacements, with a step, (c,).
 
-    `inside`: sums over the distances nearer than each border, (d, c); `beyond`: over the others,
-    (d, c); `step`: displacements by which the others differ. Returns (c,)."""
+    Sums are (d, c), nearer than each border and beyond.
+    """
     low, high = max(-step, 0), max(step, 0)
     count = len(inside) - low - high
     whole = inside[low : low + count] + beyond[high : high + count]

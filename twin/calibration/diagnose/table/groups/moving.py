@@ -199,12 +199,10 @@ def _kinds(count: int) -> Iterator[tuple[str, list[int], FloatArray]]:
 
 
 def apart(courses: Iterable[tuple[object, FloatArray]]) -> dict[str, float]:
-    """Name the differences between scans of all that jumps, wanders or drifts in one of them,
-    with their widths, the range of its course: the mean of what has moved is not where it is in
-    the other scans.
+    """Name what differs between scans because it jumps, wanders or drifts in one of them.
 
-    Args:
-        courses: place of each group of motion that is there, and its course over the frames.
+    `courses`: each group of motion's place, and course over the frames. Returns widths,
+    its range.
     """
     out: dict[str, float] = {}
     for place, course in courses:

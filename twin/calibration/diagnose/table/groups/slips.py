@@ -106,10 +106,9 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
 def _along_axes(
     n: int, frames: npt.NDArray[np.intp], course: FloatArray | npt.NDArray[np.bool_]
 ) -> FloatArray:
-    """Make the courses of a place along three axes, 0 in other scans' frames.
+    """Make a place's courses (g, frames, m) along three axes, (g, 3, n, 3 m).
 
-    `n`: number of all frames; `frames`: of the scan; `course`: (g, frames, m).
-    Returns (g, 3, n, 3 m).
+    They are 0 in other scans' frames.
     """
     g, _, m = course.shape
     out = np.zeros((g, 3, n, 3 * m))
