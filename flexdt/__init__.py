@@ -57,16 +57,9 @@ from flexdt.twin import long_work as _long_work
 def _show_work(
     what: str, progress: _long_work.Progress = None
 ) -> _typing.ContextManager[_long_work.Report]:
-    """Show the work that goes on inside the context, from when it takes seconds, as a
-    line with a bar; see `shown_work`, which is imported at the first use.
+    """Show the work inside the context, from when it takes seconds, as a line with a bar.
 
-    Args:
-        what: name of the work.
-        progress: a function that takes the fraction done; None shows the line, False
-            nothing.
-
-    Returns:
-        The context; it gives the function that takes the fraction done, 0 to 1.
+    `progress`: a function of the fraction done; None shows the line, False nothing.
     """
     # Here, because logging and threads take a third of the import of flexdt.
     from flexdt.runtime.progress import shown_work

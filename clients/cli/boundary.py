@@ -169,10 +169,10 @@ def _wire_error(error: RpcError) -> tuple[str, ...]:
 
 
 def wire_code(error: RpcError) -> int:
-    """Determine the exit code of an error reply: of a rejected script that of its problems
-    (errors only), else that of the error's kind; INVALID for an unknown one.
+    """Return an error reply's exit code: by the problems of a rejected script (-32005).
 
-    A rejected script is error -32005 with a list; without errors in it the code is INVALID."""
+    Without errors in it, or for an unknown kind, it is INVALID.
+    """
     if error.code == -32005 and isinstance(error.data, Sequence):
         wrong = [p for p in error.data if p.get("severity", "error") == "error"]
         return verdict(str(p.get("code")) for p in wrong) or INVALID
@@ -224,10 +224,7 @@ def positions(data: object, file: str = "") -> list[str]:
 
 
 def _first_line(error: Exception) -> str:
-    """Return the first line of an error's message; its type's name if it has none.
-
-    Blank lines before it are skipped.
-    """
+    """Return the first line of an error's message; else its type's name."""
     text = str(error).strip()
     if text:
         return text.splitlines()[0]

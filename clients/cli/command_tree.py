@@ -171,17 +171,10 @@ OPTIONS_WITH_VALUE: Final = ("--server", "--token-file")
 def own_first(
     words: Sequence[str], flags: Collection[str]
 ) -> tuple[list[str], list[str]]:
-    """Split words of the command line into options of `flexdt` itself and the others.
+    """Split words into options of `flexdt` itself, of `flags`, and the others, in order.
 
-    A flag may have its value in the same word (`--name=value`) or in the next one. A
-    missing value of the last flag is not noticed here. Order is kept in both lists.
-
-    Args:
-        words: in order; after `--` none is an option.
-        flags: the options to take, of `COMMON`.
-
-    Returns:
-        These options with their values, and the other words.
+    A value is in the same word (`--name=value`) or the next; a missing last one is not
+    noticed. After `--` none is an option.
     """
     first = list[str]()
     rest = list[str]()
@@ -302,9 +295,10 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
 
 
 def found(name: str) -> Callable[..., Any] | None:
-    """Load the function of a command that an installed distribution offers; None if none does.
-    `name` is a word or two, e.g. "job watch". An extension that cannot be imported raises its
-    error."""
+    """Load an installed distribution's function for a command of a word or two.
+
+    None if there is none.
+    """
     from flexdt.library.optional.extras import offered
 
     function: Callable[..., Any] | None = offered(name.replace(" ", "."), GROUP)
@@ -395,10 +389,7 @@ REMOVED_COMMANDS = ("backup", "restore")
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run one command line.
-
-    Ctrl-C, or an aborted prompt, gives INTERRUPTED. Other errors are printed and give their exit
-    code, as `_run` has it. `argv`: words after the program's name. Returns the exit code."""
+    """Run one command line and return its exit code; INTERRUPTED by Ctrl-C."""
     try:
         return _run(argv)
     except (KeyboardInterrupt, typer.Abort):
@@ -455,11 +446,7 @@ def _run(argv: Sequence[str]) -> int:
 
 
 def _spread(argv: Sequence[str]) -> list[str]:
-    """Split `--roi 'L T R B'` (or with commas) into the four words that `--roi L T R
-    B` has.
-
-    Only the word after --roi is split; all others stay.
-    """
+    """Split `--roi 'L T R B'` (or with commas) into the words of `--roi L T R B`."""
     out: list[str] = []
     for word in argv:
         whole = out[-1:] == ["--roi"]

@@ -30,12 +30,10 @@ SERVERS: Final = ("up", *PROCESS_COMMANDS)
 
 
 def speak(quiet: bool, verbose: bool) -> None:
-    """Set the amount of output on standard error in addition to warnings and errors.
+    """Set what is told on standard error in addition to warnings and errors.
 
-    Neither changes nothing but the state of a former call; with both, `quiet` silences slow
-    steps. Only `verbose` makes libraries log, at the level INFO.
-
-    `quiet`: no progress; `verbose`: slow steps with their duration, and messages of libraries.
+    `quiet`: no progress; `verbose`: slow steps with their duration, unless quiet, and
+    libraries' messages.
     """
     if quiet or verbose:
         import logging
@@ -87,13 +85,8 @@ def _make_room() -> None:
 def waited_for(words: Sequence[str]) -> Iterator[None]:
     """Show on a terminal that a command works, until it prints something.
 
-    Without a terminal on stderr, without words, or while the shell completes words
-    nothing is shown. The display is taken off by the first output, or at the end; the
-    help option is recognized by a leading minus.
-
-    Args:
-        words: of the command line; nothing is shown of help, completion, servers and
-            quiet commands.
+    Nothing is shown without a terminal or words, while the shell completes, of help,
+    servers and quiet commands.
     """
     if not (words and sys.stderr.isatty()) or COMPLETION_VARIABLE in os.environ:
         yield
@@ -109,11 +102,7 @@ def waited_for(words: Sequence[str]) -> Iterator[None]:
 
 
 def say(text: str = "", end: str = "\n") -> None:
-    """Print text (and `end`) to standard output at once; a closed pipe silences all later
-    output.
-
-    It also ends the display of a silent command. Other errors of writing are raised.
-    """
+    """Print text to standard output at once; a closed pipe silences the rest."""
     _make_room()
     try:
         print(text, end=end, flush=True)
@@ -122,11 +111,7 @@ def say(text: str = "", end: str = "\n") -> None:
 
 
 def note(text: str) -> None:
-    """Write a line of progress or a warning to standard error at once; a closed pipe
-    silences all later lines.
-
-    It also ends the display of a silent command.
-    """
+    """Write a line to standard error at once; a closed pipe silences the rest."""
     _make_room()
     try:
         print(text, file=sys.stderr, flush=True)
@@ -187,11 +172,9 @@ def table(rows: Iterable[Sequence[object]], header: Sequence[str] = ()) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Format a time span [s] for people: 3.2 s, 4 min 05 s, 2 h 03 min; "unknown" if not
+    """Format a time [s] for people: 3.2 s, 4 min 05 s, 2 h 03 min; "unknown" if not
     finite.
-
-    From 60 s on in whole seconds, from an hour on in whole minutes. Negative times are
-    formatted as seconds."""
+    """
     if not math.isfinite(seconds):
         return "unknown"
     if seconds < 60:

@@ -48,9 +48,7 @@ _heard = 0
 
 
 def leave(*_: object) -> None:
-    """End the process at once with a line on standard error and the exit code of an interrupt;
-    printed lines stay. Arguments (of a signal handler) are ignored. It does not return; exit
-    functions are not called."""
+    """End the process at once, with INTERRUPTED and a line."""
     try:
         os.write(2, LINE)
     finally:
@@ -58,10 +56,9 @@ def leave(*_: object) -> None:
 
 
 def _interrupt(number: int, frame: object) -> None:
-    """Handle SIGINT in the main thread: count it, and raise KeyboardInterrupt; end the process
-    during an import, which must not be interrupted.
+    """Handle SIGINT in the main thread: count it, and raise KeyboardInterrupt.
 
-    An import is in progress if any frame of the stack is of `IMPORT_FILE`.
+    During an import, which must not be interrupted, end the process.
     """
     global _heard
     _heard += 1
@@ -89,16 +86,10 @@ def _watch() -> None:
 
 
 def _end_if_stuck(arrivals: int) -> None:
-    """End the process where the main thread does not react, or where nothing works after
-    it has.
+    """End the process where the main thread does not react, or nothing works after.
 
-    Never returns. After SIGINT the main thread has STUCK_S to react; the thread that
-    watches for silence is started once. A handled signal within that time ends nothing;
-    other signals are ignored.
-
-    Args:
-        arrivals: descriptor that gives the number of each signal, 0 for the beginning of
-            an orderly end.
+    It never returns. After SIGINT there are STUCK_S to react; silence is watched for from
+    the first one on. `arrivals`: descriptor of signals' numbers, 0 for an orderly end.
     """
     import threading
     import time
@@ -184,11 +175,7 @@ def _family() -> list[str]:
 
 
 def _entries(folder: str) -> list[str]:
-    """List the paths in a folder; empty if it is missing, as of a process that has ended,
-    except for /proc itself (raises).
-
-    Paths are complete, in no order.
-    """
+    """List complete paths in a folder; empty if its process has ended (not /proc)."""
     try:
         return [f"{folder}/{name}" for name in os.listdir(folder)]
     except FileNotFoundError:
@@ -198,10 +185,7 @@ def _entries(folder: str) -> list[str]:
 
 
 def _text(file: str) -> str:
-    """Read a small text file; "" if it is missing or its process has ended.
-
-    Other errors of reading are raised; other characters than ASCII are replaced.
-    """
+    """Read a small text file; "" if it is missing or its process has ended."""
     try:
         with open(file, encoding="ascii", errors="replace") as opened:
             return opened.read()
@@ -253,12 +237,7 @@ def main() -> None:
 
 
 def _end_without_teardown() -> None:
-    """End the process with `INTERRUPTED`, after its exit functions and without freeing its
-    objects.
-
-    An interruption in the compiler leaves objects half made, and freeing them can crash.
-    Output is flushed; it does not return.
-    """
+    """End the process after its exit functions, without freeing half made objects."""
     import atexit
 
     atexit._run_exitfuncs()

@@ -84,21 +84,10 @@ def span(word: str, what: str) -> tuple[float, float]:
 def numbers(
     word: str, what: str, form: str, *counts: int, by: str = ",", whole: bool = False
 ) -> list[float]:
-    """Read a list of finite numbers.
+    """Read a list of finite numbers, as floats; blanks and case do not matter.
 
-    Blanks around parts are dropped, and letters are read in any case. Returns the list,
-    also of whole numbers as float.
-
-    Args:
-        word: from the command line.
-        what: name of the list, for errors.
-        form: of the list with an example, for errors: `X,Y,Z, e.g. 0,0,-5.5`.
-        counts: allowed lengths.
-        by: separator.
-        whole: they are integers above 0.
-
-    Raises:
-        typer.BadParameter: another count, or a part that is no such number.
+    `what` and `form` are its name and form with an example, for typer.BadParameter;
+    `counts`: allowed lengths; `by`: separator; `whole`: integers above 0.
     """
     parts = [part.strip() for part in word.lower().split(by)]
     if len(parts) not in counts or (
@@ -133,11 +122,7 @@ def names(word: str) -> tuple[str, ...]:
 
 
 def require_ending(file: Path, *allowed: str) -> None:
-    """Check a file's ending.
-
-    `allowed` are endings with their dot, lower case; the file's of any case. Raises
-    typer.BadParameter: another one.
-    """
+    """Check a file's ending, of any case; raises typer.BadParameter."""
     if file.suffix.lower() not in allowed:
         raise typer.BadParameter(
             f"{file.name}: the ending must be {' or '.join(allowed)}"

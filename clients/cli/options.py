@@ -114,20 +114,13 @@ def option(
     """Make the default of a command's parameter that is an option of the command line.
 
     Args:
-        default: where the option is left out; `...` for one that must be given.
-        words: flags as typed, and one line of help. Flags follow from the parameter's name, but
-            a switch that is only ever on has to name its flag, or typer adds one that switches
-            it off. The help is that of the command's docstring (`Args:`) if it is not given
-            here.
-        among: gives the words that are allowed. It is called when the command line is built, so
-            that each list has one home, and imports nothing heavy.
-        proposes: gives the values that a shell completes, see `value_completion`.
-        written: it is a path that the command writes to; it is tried before the command begins.
-        details: of `typer.Option`, such as metavar, min and max.
-
-    Returns:
-        typer's option, with `among` and `written` as attributes; nothing is called or
-        checked now.
+        default: `...` for one that must be given.
+        words: flags, of which a switch that is only ever on needs one, and one line of
+            help; None is the docstring's.
+        among: gives allowed words when the command line is built.
+        proposes: gives values that a shell completes.
+        written: a path to write to, tried before the command begins.
+        details: of `typer.Option`.
     """
     flags = [word for word in words if word.startswith("-")]
     help = next((word for word in words if not word.startswith("-")), None)
@@ -140,17 +133,7 @@ def option(
 def argument(
     default: object, metavar: str, help: str = "", proposes: Proposer | None = None
 ) -> Any:
-    """Make the default of a command's parameter that is a word of its own.
-
-    Args:
-        default: where the word is left out; `...` if it must be given.
-        metavar: the word in the help.
-        help: one line; default: that of the command's docstring.
-        proposes: gives the values that a shell completes, see `value_completion`.
-
-    Returns:
-        typer's argument; an empty help becomes None.
-    """
+    """Make the default of a command's parameter that is a word of its own."""
     return typer.Argument(
         default, metavar=metavar, help=help or None, autocompletion=proposes
     )

@@ -98,10 +98,9 @@ KEYS: Final = {
 
 
 def config_file(environ: Mapping[str, str]) -> Path:
-    """Return the path of the configuration file, which need not exist: that named in the
-    environment, else flexdt/config.toml in XDG_CONFIG_HOME or ~/.config.
+    """Return the path of the configuration file, which need not exist.
 
-    FLEXDT_CONFIG names it; ~ is expanded. An empty variable counts as not set.
+    FLEXDT_CONFIG, else flexdt/config.toml in XDG_CONFIG_HOME or ~/.config.
     """
     named = environ.get(f"{PREFIX}CONFIG")
     if named:
@@ -205,10 +204,9 @@ def _require_known(
 ) -> None:
     """Check the keys of a table, or those outside all tables.
 
-    The first unknown key raises. The error also suggests a similar key.
-    `where`: beginning of the message. `given`: keys. `known`: the allowed ones. `tables`: names
-    of tables, which the error lists beside `known`; as keys they are refused.
-    Raises CommandError: an unknown key; lists keys and tables."""
+    Raises CommandError for the first unknown one, listing `known` and `tables`; `where`
+    begins the message.
+    """
     for key in given:
         if key not in known:
             from flexdt.twin.errors import UnknownNameError

@@ -19,17 +19,12 @@ DEFAULT_SERVER: Final = str(Address(LOOPBACK, TWIN_PORT))
 def connect(server: str | None = None, token_file: str | None = None) -> TwinClient:
     """Connect to a twin and return the client, to be used as a context manager.
 
-    Arguments that are None come from the user's configuration, see `configuration`. A token file
-    given here or configured comes before a token. With certificates configured it connects by
-    TLS. It blocks until the twin has answered.
+    Arguments that are None come from the user's `configuration`; a token file comes
+    before a token. With certificates it connects by TLS. It blocks until the twin has
+    answered.
 
-    Args:
-        server: HOST:PORT, see `server_address`; 127.0.0.1:55000 if nothing is configured.
-        token_file: file whose first line is the session's token; shows none by default.
-
-    Raises typer.BadParameter: the address has another form; CommandError: the token or
-    certificate file cannot be read or holds none, or the configuration is wrong; OSError:
-    nothing answers.
+    Raises typer.BadParameter: the address has another form; CommandError: token,
+    certificate or configuration; OSError: nothing answers.
     """
     own = configuration()
     host, port = server_address(server or own.server or DEFAULT_SERVER)

@@ -49,10 +49,7 @@ _R = TypeVar("_R")
 
 
 def back_off(first_s: float = FIRST_PAUSE_S) -> Iterator[float]:
-    """Yield pauses between attempts to connect [s], for ever: each twice the one before,
-    at most `LONGEST_PAUSE_S`.
-
-    The first is `first_s`, whatever its size; it never ends and waits for nothing itself."""
+    """Yield pauses [s] for ever, each twice the one before, to a limit."""
     pause = first_s
     while True:
         yield pause
@@ -171,18 +168,10 @@ class Core:
             raise
 
     def follow(self, listener: Listener, params: Mapping[str, object]) -> None:
-        """Have `listener` subscribed with these params whenever a connection is made;
-        nothing is subscribed at once.
+        """Have `listener` subscribed with these params whenever a connection is made.
 
-        Rate, and for projections kind and binning, must be those of all other listeners to
-        the same topic.
-
-        Args:
-            listener: gets the events.
-            params: of the subscription; replace the listener's earlier ones.
-
-        Raises:
-            ValueError: they are not.
+        Raises ValueError: its rate, kind or binning differ from other listeners' to a
+        topic.
         """
         for other, theirs in self._listeners.items():
             if other is listener:
@@ -514,10 +503,9 @@ class AsyncTwinClient(SharedMethods):
         wait_s: float = 0.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        """Prepare a client for `transport`, or for TCP to host and port if None; nothing
-        is sent before `connect`. Arguments: see the class.
+        """Prepare a client for `transport`, or for TCP to host and port if None.
 
-        With a transport, host, port and ssl are ignored.
+        Nothing is sent before `connect`. Arguments: see the class.
         """
         link: Transport
         if transport is None:
@@ -601,9 +589,10 @@ class AsyncTwinClient(SharedMethods):
 
 @functools.cache
 def _loop() -> asyncio.AbstractEventLoop:
-    """Start the event loop of all synchronous clients in a thread of its own; it ends with the
-    process. Cached: all calls return the same loop. At Python's exit `_end_links` runs; a forked
-    process starts its own."""
+    """Start the event loop of all synchronous clients in a thread, once.
+
+    At exit `_end_links` runs.
+    """
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, name="flexdt-clients", daemon=True).start()
     atexit.register(_end_links)
@@ -634,11 +623,9 @@ if hasattr(os, "register_at_fork"):  # a forked process has no thread that runs 
 
 
 def _result(work: Coroutine[Any, Any, _R]) -> _R:
-    """Run `work` on the clients' loop, in its thread, and return its result or raise its
-    error; an interrupt here cancels it.
+    """Run `work` on the clients' loop and return its result; an error cancels it.
 
-    It blocks the calling thread without a time limit; never call it from the loop's own
-    thread.
+    Never call it from that loop.
     """
     doing = asyncio.run_coroutine_threadsafe(work, _loop())
     try:
@@ -760,10 +747,9 @@ class TwinClient(SharedMethods):
         return Subscription(events, self._wait)
 
     def _perform(self, effect: Effect) -> object:
-        """Perform one effect and return its result: a `Tell` by calling its function in
-        this thread, all others on the clients' loop.
+        """Perform one effect and return its result, blocking until it is done.
 
-        Blocks until it is done; the result of a Tell is the function's own.
+        A `Tell` calls its function in this thread.
         """
         if isinstance(
             effect, Tell

@@ -172,14 +172,10 @@ class AsyncSubscription:
         keep_alive: Callable[[], Awaitable[object]],
         cancel: Callable[[AsyncSubscription], Awaitable[object]],
     ) -> None:
-        """Store the subscription's parameters; nothing is sent before it is entered or awaited.
+        """Store the subscription's parameters; nothing is sent before it is entered.
 
-        Args:
-            topics: names of the topics.
-            max_queue: events that wait at most; older ones are dropped then, and counted.
-            start: subscribes.
-            keep_alive: reconnects if the connection is lost.
-            cancel: unsubscribes.
+        `max_queue`: events that wait; older ones are dropped then, and counted. `start`
+        subscribes, `keep_alive` reconnects, `cancel` unsubscribes.
         """
         self.topics = topics
         self.dropped = 0

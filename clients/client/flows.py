@@ -65,18 +65,10 @@ def ask(
     /,
     **params: object,
 ) -> Flow[_M]:
-    """Call `method` and validate its result; params that are None are not sent.
+    """Call `method` with params but those that are None; return its result's model.
 
-    Returns the method's result model. With "seconds" in the method's limits `patience_s`
-    is ignored and there is no time limit.
-
-    Args:
-        method: of the wire.
-        patience_s: see `Ask`; a method whose time the server limits is waited for in any case.
-        params: of the method, by name.
-
-    Raises:
-        RpcError: the server's answer is an error, or is not the method's result.
+    With "seconds" in its limits there is no time limit. Raises RpcError: the answer is an
+    error, or no such result.
     """
     given = {k: v for k, v in params.items() if v is not None}
     answer = yield Ask(

@@ -80,16 +80,13 @@ class KeptConnection:
     ) -> None:
         """Prepare a client for the address, not yet connected; `run` connects.
 
-        No attempt to reconnect is made by the client itself. `problem` says why there is
-        no connection. A request waits up to `HELLO_S` for the hello only. A
-        subscription's topics are stored in `topics`; without one it is empty.
+        The client itself never reconnects; `problem` says why there is no connection. A
+        request waits `HELLO_S` for the hello only.
 
         Args:
-            address: of the twin.
             name: of this client, which the twin shows.
-            on_event: called with topic and parameters of each event.
             on_change: called when the connection is made or lost.
-            subscription: parameters of `events.subscribe`, subscribed to after each connection.
+            subscription: parameters of `events.subscribe`, with `topics`.
         """
         self.address = address
         self.name = name

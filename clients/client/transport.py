@@ -401,10 +401,9 @@ class Link:
             self._on_end()
 
     def _take(self, message: Message) -> None:
-        """Give a message's answers to the requests that wait for them (canceled ones are
-        skipped), and its events to `on_event`; the rest is ignored.
+        """Give a message's answers to the requests that wait, and events to `on_event`.
 
-        Only notifications named "event" with an object as params count as events.
+        Only notifications "event" with an object as params are events.
         """
         for item in self.calls.receive(message):
             match item:

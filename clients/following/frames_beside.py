@@ -28,14 +28,10 @@ from flexdt.twin.machine.kinematics import motor_poses
 
 
 def newest_frame(folder: Path) -> tuple[Path, float] | None:
-    """Find the TIFF that was written last; dark and flat images are skipped.
+    """Find the TIFF that was written last, and when [s since the epoch].
 
-    Only the folder itself is searched, for *.tif*. Names that begin with "di" (dark) or
-    "io" (flat) are skipped, and so are files deleted meanwhile. The time is that of the
-    last change.
-
-    Returns:
-        Its path and time of writing [s since the epoch]; None if there is none.
+    Dark ("di...") and flat ("io...") images are skipped, and so are files deleted
+    meanwhile.
     """
     found = []
     for path in folder.glob("*.tif*"):

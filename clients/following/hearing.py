@@ -14,17 +14,13 @@ from flexdt.twin.script.grammar import own_name
 
 
 def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -> Heard:
-    """Decode one message of the scanner to a follower's message (`Heard`), with its typed
-    command or question.
+    """Decode one message of the scanner to a follower's message, with its command or
+    question.
 
-    Bytes before the first "{" are skipped. Bytes that are no event in UTF-8 are tried once more
-    as Latin-1. The component's name is replaced by the axis's own spelling; an event without a
-    reply type becomes "SEND".
-    `data`: bytes of the message; UTF-8, or one byte for each character where a cluster is not
-    UTF-8. A prefix of the object, such as a topic, is left out. `axes`: motors and virtual axes
-    of the machine. `stamp`: time of day, hh:mm:ss.mmm. `late_s`: uncertainty of the time: it may
-    have come so much earlier [s].
-    Raises AcquilaError: the bytes are no event.
+    A prefix before the first "{" is skipped; bytes that are no event in UTF-8 are tried
+    as Latin-1. Components get the axis's own spelling; no reply type becomes "SEND".
+    `stamp`: time of day, hh:mm:ss.mmm; `late_s`: it may have come so much earlier [s].
+    Raises AcquilaError: no event.
     """
     data = data[max(0, data.find(b"{")) :]
     try:
@@ -41,11 +37,9 @@ def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -
 
 
 def _read(event: AcquilaEvent, axes: Collection[str]) -> tuple[c.Command | None, str]:
-    """Read the typed command, or the name of a question, as (command, ""), (None, name);
-    (None, "") for any other or invalid command.
+    """Read the typed command, or the name of a question: (command, ""), (None, name).
 
-    A command counts only if its type is one of the script's commands; a refused one gives
-    (None, "") and raises nothing.
+    (None, "") for any other or refused command.
     """
     try:
         command = read_command(event, axes)

@@ -62,17 +62,17 @@ def format_recorded(message: Recorded) -> bytes:
 
 
 def read_recording(data: bytes) -> Iterator[Recorded]:
-    """Yield the messages of a recording; times go on after midnight.
+    r"""Yield the messages of a recording; times [s] go on after midnight.
 
-    They count from the midnight nearest to the first message, and may be below 0. A time
-    in whole seconds is taken as the end of its second, 1 s late. Bytes before the first
-    stamp are skipped. The last line end of each message is removed. Each time is put on
-    the day nearest to the previous message's, so steps back in time are kept.
+    They count from the midnight nearest to the first message; each is on the day nearest
+    to the one before. A time in whole seconds is the end of its second, 1 s late. Bytes
+    before the first stamp are skipped.
 
     Example:
-        >>> recording = b"[23:59:59] {}\\n[00:00:01.5 0.002] {}\\n"
+        >>> recording = b"[23:59:59] {}\n[00:00:01.5 0.002] {}\n"
         >>> [(m.at_s, m.late_s) for m in read_recording(recording)]
-        [(0.0, 1.0), (1.5, 0.002)]"""
+        [(0.0, 1.0), (1.5, 0.002)]
+    """
     stamps = list(STAMP.finditer(data))
     last = 0.0
     for stamp, end in zip(

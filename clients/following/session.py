@@ -81,18 +81,11 @@ class FollowSession:
         self._midnight = self.clock() - (now - midnight).total_seconds()
 
     def message(self, data: bytes, at: float | None = None, late_s: float = 0.0) -> None:
-        """Take one message, which came between `late_s` before `at` and `at`: record it, update
-        the mirror, report alarms and executed lines.
+        """Take one message, which came within `late_s` before `at` (None: now): record
+        it, update the mirror, report alarms and executed lines.
 
-        Messages that are no events are counted in `unread`. An executed line is reported
-        by `executed`, alarms by `tell`, a change by `changed`; the recording gets every
-        message, also one that is counted as unread. Only the first unread one is stored
-        as the example, cut to 200 bytes.
-
-        Args:
-            data: content.
-            at: time by the session's clock [s]; now without.
-            late_s: how long it may have waited.
+        Messages that are no events are counted in `unread`, the first an example.
+        Executed lines go to `executed`, alarms to `tell`, changes to `changed`.
         """
         if at is None:
             at = self.clock()

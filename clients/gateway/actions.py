@@ -88,10 +88,8 @@ def setting(
 ) -> Action:
     """Make the action of a command that only sets a value.
 
-    `method`: of the twin; `params`: its parameters, from the command; `reply`: the text of ACK,
-    from the command.
-    Returns the action: it sends the request, waits for the answer and returns the reply; errors
-    of the twin become Refusal.
+    `params` gives the parameters of the twin's `method` from the command, `reply` the
+    text of ACK. Errors become Refusal.
     """
 
     async def send(
@@ -320,10 +318,7 @@ def rate_setting(what: Rate, digits: int) -> Action:
 
 
 def _why(state: State) -> str:
-    """Return the reason of the safety state in brackets, with a leading blank; empty if all is
-    well.
-
-    The message of the safety state, or its name if there is none."""
+    """Return the reason of the safety state in brackets, or nothing."""
     safety = state.safety
     if safety.state != "ok":
         return f" ({safety.message or safety.state})"

@@ -105,11 +105,10 @@ class ConnectedTwin:
         self._news = asyncio.Event()
 
     def heard(self, topic: str, params: Mapping[str, object]) -> None:
-        """Take an event of the twin: keep the status of a job, and wake `news`, whatever the
-        topic.
+        """Take an event of the twin: keep a job's status, and wake `news`.
 
-        The end of a job that was not kept before is not kept.
-        `topic`: other topics than "job" only wake; `params`: of the event, with `data`."""
+        A job first heard of at its end is not kept.
+        """
         if topic == "job":
             status = JobStatus.model_validate(params["data"])
             if status.state not in FINAL_STATES or status.job in self.jobs:

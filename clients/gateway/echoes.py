@@ -32,14 +32,12 @@ class ScriptLine:
 
 
 def script_lines(script: bytes) -> tuple[ScriptLine, ...]:
-    """Read the commands of a script, one for each step of its plan.
-
-    Commands of the grammar only; other rows are left out. `waits` is False for a line
-    whose reply is not ACK.
+    r"""Read the commands of a script, one a step of its plan; `waits` only for ACK.
 
     Example:
-        >>> script_lines(b"tube\\txrayon\\t\\t\\tACK\\t\\t")
-        (ScriptLine(words=('tube', 'xrayon', '', ''), waits=True),)"""
+        >>> script_lines(b"tube\txrayon\t\t\tACK\t\t")
+        (ScriptLine(words=('tube', 'xrayon', '', ''), waits=True),)
+    """
     made = {row.line: row for row in rows(script)}
     found = []
     for command in read_script(script)[0].commands:

@@ -339,10 +339,9 @@ class Gateway:
             self._awaited.pop(key, None)
 
     def _forward(self, event: AcquilaEvent) -> None:
-        """Send on the reply of a component elsewhere, and wake the command that waits for
-        it; an echo of one of our own events is dropped.
+        """Send on the reply of a component elsewhere, and wake who waits for it.
 
-        Recognized are the last 256 events sent.
+        An echo of our last 256 events is dropped.
         """
         text = format_event(event)
         if hash(text) in self._recent:
@@ -385,9 +384,10 @@ class Gateway:
                 self._log_failure("session.control")
 
     def _send(self, event: AcquilaEvent) -> None:
-        """Format an event, remember its hash (of the last 256) to recognize its echo, and
-        publish it without waiting. A subscriber that is too slow does not get it; characters
-        outside UTF-8 are replaced."""
+        """Publish an event without waiting, and remember its hash to recognize its echo.
+
+        Too slow a subscriber does not get it.
+        """
         text = format_event(event)
         self._recent.append(hash(text))
         # A PUB socket never blocks: it drops messages that a slow subscriber does not take.
@@ -492,11 +492,7 @@ def check_loopback(host: str) -> None:
 
 
 def bind_endpoint(host: str, port: int) -> str:
-    """Format an address as ZeroMQ's endpoint: IPv6 in brackets, localhost as 127.0.0.1;
-    port 0 is any free port.
-
-    Other names are used as they are.
-    """
+    """Format an address as ZeroMQ's endpoint: IPv6 in brackets; port 0 is any."""
     if ":" in host:
         place = f"[{host}]"
     elif host == "localhost":

@@ -145,16 +145,13 @@ class Recording:
             return files.path / file
 
     def adopt(self, folder: Path, state: State) -> int:
-        """Add the images of a data set that the twin made, flat and dark ones too, and rewrite
-        the texts.
+        """Add the images of the twin's data set, flat and dark ones too; return their
+        number.
 
-        Files are linked or copied under their own names; frames that are no file of the folder
-        are copied. Blocks begin at the time of `state` minus the set's duration. A document
-        without frames adds none.
-        `folder`: of the data set; `state`: of the twin, after the data set was made.
-        Returns the number of images.
-        Raises DatasetError, OSError: the data set cannot be read, a name is taken, no room, or
-        the recording was closed meanwhile."""
+        Files are linked or copied under their own names. Blocks begin at the time of
+        `state`, after the set was made, less its duration. Raises DatasetError, OSError:
+        it cannot be read, a name is taken, no room, or the recording is closed.
+        """
         source = Directory(folder.parent).folder(folder.name)
         document = read_document(source)
         with self._turn:
@@ -174,10 +171,7 @@ class Recording:
                 self._write_texts()
 
     def close(self) -> None:
-        """Close the folder, once a saving in progress has ended.
-
-        A later saving raises DatasetError. A second call does nothing.
-        """
+        """Close the folder, once a saving has ended; a later one raises."""
         with self._turn:
             self._closed = True
             if self._folder is not None:
@@ -306,11 +300,7 @@ def kind_of_file(file: str) -> FrameKind:
 
 
 def _same_file(name: str, source: Directory, files: Directory, *, linked: bool) -> None:
-    """Link an image file into another folder, or copy its bytes where links are not possible.
-
-    A link is tried only if `linked`. Errors of the copy are raised.
-    `name`: of the file; `source`: folder; `files`: the other folder; `linked`: try a link.
-    """
+    """Link an image file into another folder if `linked`, or else copy its bytes."""
     with suppress(OSError, NotImplementedError):
         if linked:
             source.link(name, name, files)

@@ -127,13 +127,10 @@ def read_command(event: AcquilaEvent, axes: Collection[str]) -> c.Command:
 
 
 def _extra(event: AcquilaEvent, name: str) -> c.Command:
-    """Read a command that the grammar of scripts does not have.
+    """Read a command that the grammar of scripts does not have, case and blanks aside.
 
-    Letter case and repeated blanks do not matter. A component without a table of its own (an
-    axis) takes the general one.
-
-    `event`: the command; `name`: of the component, as the twin calls it.
-    Raises Refusal: the component does not know it; the message lists the known ones.
+    A component without a table of its own (an axis) takes the general one. Raises
+    Refusal, listing known commands.
     """
     table = _EXTRA.get(name, _EXTRA[""])
     asked = " ".join(event.command.lower().split())

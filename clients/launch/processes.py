@@ -179,11 +179,10 @@ class Servers:
         return process.returncode
 
     def log_tail(self, lines: int = 5) -> Sequence[str]:
-        """Read the last lines of the processes' standard error; empty if the log cannot
-        be read.
+        """Read the last lines of the processes' standard error, oldest first.
 
-        `lines` is how many, at most; without line ends, oldest first, undecodable bytes
-        replaced."""
+        Empty if it cannot be read.
+        """
         try:
             text = self._log_path.read_text(encoding="utf-8", errors="replace")
         except OSError:
@@ -352,10 +351,9 @@ class LocalTwin:
             raise ServersError(f"data: {error.filename}: {reason_of(error)}") from None
 
     def stop(self) -> None:
-        """End the client and the servers, and delete a temporary data folder; does
-        nothing if they do not run.
+        """End client and servers, and delete a temporary data folder.
 
-        The client is closed before the servers; `start` may be called again.
+        `start` may be called again.
         """
         running = self._running
         self._running = None

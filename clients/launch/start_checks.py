@@ -16,19 +16,11 @@ def require_startable(
 ) -> None:
     """Check the words that a twin server is started with.
 
-    Of a sample only its existence is checked, and not where the data folder has any
-    content, which may be a sample of that name. "" and the empty stage are allowed.
+    Of a sample only the name, and not where the data folder may hold one. None: the
+    FleX-ray, its profile, the twin's own sample and folder.
 
-    Args:
-        machine: shipped name or file; None for the FleX-ray.
-        profile: of zero offsets; None for the machine's. Not checked if both are None.
-        sample: on the stage at the start; None for the twin's own.
-        data: the twin's folder, made by the twin if it is missing; None for one of its
-            own.
-
-    Raises:
-        TwinError: an unknown name, or a file that does not hold.
-        OSError: the folder cannot be written.
+    Raises TwinError: an unknown name, or a wrong file; OSError: the folder cannot be
+    written.
     """
     from flexdt.library import machines
 

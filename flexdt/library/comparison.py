@@ -153,15 +153,10 @@ def virtual(
 def _figures(
     residual: FloatArray, images: Float32Array | None
 ) -> dict[str, float | None]:
-    """Compute the figures of residuals and difference images by the names of `FIGURES`.
+    """Compute the `FIGURES` of residuals (n, k, 2) [px], nan unseen, and difference
+    images.
 
-    Args:
-        residual: (n, k, 2) [px]; nan where unseen.
-        images: difference images; None without.
-
-    Returns:
-        rms_px (per coordinate), max_px (largest length, nan left out), image_rms (None
-        without images).
+    That is rms a coordinate, largest length, and the images' rms (None without).
     """
     length = np.linalg.norm(residual, axis=2)
     if images is None:
@@ -178,11 +173,9 @@ def _figures(
 
 
 def rows_of(document: Mapping[str, Any]) -> list[tuple[Any, ...]]:
-    """List the rows of a comparison's table: correction, rms and largest [px], rms of the
-    images.
-
-    Rows of before, after and in_force, those that the document has; None for a figure
-    that is unknown."""
+    """List the table's rows that a comparison has: correction, rms, largest [px], image
+    rms.
+    """
     return [
         (name, *(document[name][figure] for figure in FIGURES))
         for name in ("before", "after", "in_force")

@@ -278,15 +278,8 @@ def load(
 def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
     """Write a geometry to a file; see `ConeVec.save`.
 
-    Args:
-        cone_vec: the geometry.
-        file: its path.
-        format: name of `FORMATS`; None: that of the file's ending, where .json is
-            flexdt's own document.
-
-    Raises:
-        ExchangeError: an unknown format or ending, or a format that cannot carry the
-            geometry.
+    `format`: of `FORMATS`; None: by the file's ending. Raises ExchangeError: an unknown
+    format, or one that cannot carry the geometry.
     """
     path = Path(file)
     if format is None and path.suffix.lower() == OWN_ENDING:

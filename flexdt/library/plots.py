@@ -91,10 +91,7 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
 def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
     """Plot line integrals of one projection, as the source sees it, with a color bar.
 
-    `data`: the data set. `index`: of the projection. `axes`: matplotlib's, to draw into; None
-    makes a figure.
-    Returns the axes.
-    Raises DatasetError: as `DataSet.line_integrals`.
+    `axes`: matplotlib's, or None. Raises DatasetError: as `DataSet.line_integrals`.
     """
     axes = _room(axes)
     shown = axes.imshow(data.line_integrals(index), cmap="gray")
@@ -292,9 +289,7 @@ def _spread_ticks(axis: Any) -> None:
 
 
 def _pyplot() -> Any:
-    """Import matplotlib.pyplot.
-
-    Raises TwinError: it is not installed."""
+    """Import matplotlib.pyplot; TwinError if not installed."""
     require_plots()
     from matplotlib import pyplot
 

@@ -39,12 +39,7 @@ class Markup(str):
 
 
 def page(title: str, body: Sequence[str]) -> str:
-    """Make a complete HTML page.
-
-    Args:
-        title: of the window.
-        body: HTML, made by the functions of this module; empty parts are left out.
-    """
+    """Make a complete HTML page of HTML parts, empty ones left out."""
     return PAGE.format(
         title=html.escape(title), body="\n".join(part for part in body if part)
     )

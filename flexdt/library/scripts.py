@@ -73,14 +73,10 @@ def plan(
 
 
 def check(plan: ScanPlan, sample: object = None) -> CheckReport:
-    """Check a plan; see `ScanPlan.check`. Collisions are checked if the machine has
-    components, and exposures if there is a sample and the plan has no errors.
+    """Check a plan; see `ScanPlan.check`.
 
-    The plan's start counts as known unless it is the machine's default one.
-
-    Args:
-        plan: of a script.
-        sample: on the stage, anything that `flexdt.simulate` takes; None: no sample.
+    Collisions are checked if the machine has components; exposures with a `sample` and
+    without errors. The start is known unless it is the default.
     """
     if sample is None:
         phantom = None

@@ -19,11 +19,10 @@ __all__ = ["flexdt_twin"]
 def flexdt_twin(
     request: pytest.FixtureRequest, tmp_path: Path
 ) -> Iterator[testing.InProcessTwin]:
-    """Provide a twin in process (`flexdt.testing.twin`), its data in `tmp_path`, one for
-    each test, and close it after the test.
+    """Provide a twin in process for each test, its data in `tmp_path`.
 
-    Arguments of `twin` come by indirect parameters:
-    `@pytest.mark.parametrize("flexdt_twin", [{"machine": "micro_ct"}], indirect=True)`."""
+    Arguments come by indirect parameters, such as `{"machine": "micro_ct"}`.
+    """
     with testing.twin(
         **{"data": tmp_path / "twin", **getattr(request, "param", {})}
     ) as scanner:

@@ -86,9 +86,8 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     def run_until_complete(self, future: Generator[Any, None, T] | Awaitable[T]) -> T:
         """Run the loop until a future is done, and return its result.
 
-        Meanwhile a wait that no timer ends raises Deadlock; a loop that runs in another way
-        waits for real, as another thread may end the wait.
-        Raises Deadlock: no event is left that could complete it."""
+        Raises Deadlock: no event is left.
+        """
         self.alone = True
         try:
             return super().run_until_complete(future)
@@ -96,15 +95,9 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
             self.alone = False
 
     def call_exception_handler(self, context: dict[str, Any]) -> None:
-        """Log what failed in a callback or a task; end the loop with what is no `Exception`.
+        """Log what failed in a callback; raise what is no `Exception`.
 
-        Such is the end of a test at its time limit: it comes wherever the thread is, also
-        in a callback, whose caller would log it and wait for ever for what the callback had
-        to do.
-
-        Raises:
-            BaseException: the one of the context, unless it is an `Exception` or a
-                cancellation.
+        So a test ends at its time limit.
         """
         error = context.get("exception")
         if _ends_all(error):
@@ -134,8 +127,8 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     ) -> asyncio.Future[Any]:
         """Run `func` in the loop's thread, soon; `executor` is ignored.
 
-        With a random generator after a delay drawn from `THREAD_DELAYS_S` [virtual s],
-        else in the next turn. The future gets the result or the error."""
+        With a random generator after one of `THREAD_DELAYS_S` [virtual s].
+        """
         done: asyncio.Future[Any] = self.create_future()
         later = 0.0 if self._rng is None else self._rng.choice(THREAD_DELAYS_S)
         self.call_later(later, _work, done, func, args)
@@ -337,9 +330,9 @@ class InProcessTransport(asyncio.Transport):
             self._inbox.put_nowait(bytes(data))
 
     def close(self) -> None:
-        """End the connection, from either side; a second call does nothing.
+        """End the connection, from either side, once.
 
-        A waiting `receive` returns []; the server learns of it in the loop's next turn.
+        A waiting `receive` returns []; the server learns of it in the next turn.
         """
         server, self._server = self._server, None
         if server is not None:
@@ -382,11 +375,7 @@ class InProcessTwin:
     client: TwinClient
 
     def __init__(self, loop: SimulatedLoop, server: TwinServer) -> None:
-        """Take a loop and a server; connections use the server's own shell, without
-        sockets.
-
-        Starts neither of them and connects nothing; `client` is set by `twin`.
-        """
+        """Take a loop and a server, neither started; `client` is set by `twin`."""
         self.loop = loop
         self.server = server
         self.data = server.root
@@ -407,15 +396,13 @@ class InProcessTwin:
         return InProcessTransport(self.loop, self._shell.connection)
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """Run a coroutine on the twin's loop, and return its result; virtual time passes
-        meanwhile.
+        """Run a coroutine on the twin's loop in virtual time, and return its result.
 
-        From a thread other than the running loop's, it waits for the result there.
+        From another thread, it waits for it there.
 
         Raises:
             Deadlock: no event is left that could end the wait.
-            RuntimeError: called in an event loop, where it would wait for itself; the
-                coroutine is closed.
+            RuntimeError: called in an event loop, where it would wait for itself.
         """
         here = asyncio._get_running_loop()
         if self.loop.is_running() and here is not self.loop:

@@ -515,11 +515,10 @@ class Imaging:
     def _too_large(
         self, sample: Sample, need: int, left: int, limit: int, who: str
     ) -> RpcError:
-        """Make the error -32008 for a sample that needs more memory than is left; returned, not
-        raised.
+        """Make (do not raise) the error -32008 for a sample that needs more memory than
+        is left.
 
-        `sample`: that is too large; `need`: its memory [bytes]; `left`: memory that is left
-        [bytes]; `limit`: memory in all [bytes]; `who`: owner of the memory, for the message.
+        Sizes are in bytes; `who` owns the memory.
         """
         error = too_large(
             f"the sample {sample.name!r} in the memory of {who}", need, max(0, left)
@@ -685,9 +684,7 @@ class Imaging:
 
 
 def _add(total: Float32Array, part: Float32Array, factor: float, *, first: bool) -> None:
-    """Add factor * part to `total`, in place; the first part replaces what is there. One pass
-    through memory where that is enough: of whole images it takes as long as projecting them.
-    """
+    """Add factor * part to `total`, in place; the first part replaces what is there."""
     if not first:
         total += np.float32(factor) * part
     elif factor == 1.0:

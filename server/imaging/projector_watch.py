@@ -117,12 +117,12 @@ class ProjectorWatch:
             answer.cancel()
 
     def _report(self, client: Watched, problem: str | None) -> None:
-        """Record the problem of one projector, and announce a change of the pool's problem.
+        """Record the problem of one projector (None: it answers), and announce the
+        pool's.
 
-        The pool has a problem only if all its projectors have one: then `problem` is that of the
-        first projector, else None. One that has not been checked yet counts as without.
-        `changed` is called if `problem` differs from before, its text included.
-        `client`: of the projector; `problem`: None if it answers."""
+        The pool has the first projector's problem if all have one; unchecked ones have
+        none.
+        """
         self._problems[client] = problem
         known = [self._problems.get(each) for each in self.clients]
         now = None if None in known else known[0]

@@ -77,9 +77,7 @@ CUT_OFF = 4
 
 
 def counts_photons(physics: Physics) -> bool:
-    """Return whether a physics computes photons through tube, materials and panel, instead
-    of the response to line integrals.
-    """
+    """Return whether a physics computes photons, instead of line integrals' response."""
     match physics:
         case "ideal":
             return False
@@ -304,12 +302,9 @@ class Radiography:
         camera: CameraSettings,
         exposures: Sequence[ExposureSettings],
     ) -> list[Scattered]:
-        """Simulate the scatter of each image by its own view alone, one after the other.
+        """Simulate the scatter of each image by its own view (n, 12) alone.
 
-        So a scan that is resumed has the same bytes. One beam is made for each voltage.
-        `thing`: the sample's voxels; `chain`: tube, materials, panel; `views`: (n, 12) cone_vec
-        rows [mm]; `camera`: of all images; `exposures`: of each image, n.
-        Returns the scatter of each image, n.
+        So a scan that is resumed has the same bytes. `thing`: the sample's voxels.
         """
         beams = {
             kV: mc.Beam.of(chain, kV) for kV in {exposure.kV for exposure in exposures}
@@ -373,10 +368,10 @@ class Radiography:
     def signal(
         self, radiograph: Radiograph, camera: CameraSettings, exposure: ExposureSettings
     ) -> Float32Array:
-        """Compute the expected counts above dark as if X-rays were on. Without noise and dark
-        counts, and not clipped at full scale; whether X-rays are on in `exposure` is not used.
-        Of physics other than "ideal" the exposure is in the radiograph already. Returns float32
-        (rows, cols)."""
+        """Compute the expected counts above dark as if X-rays were on, (rows, cols).
+
+        Without noise, not clipped. But for "ideal" the exposure is in the radiograph.
+        """
         if radiograph.expected is not None:
             return expected_counts(self.panel, camera, radiograph.expected.mean_e)
         lit = replace(exposure, xrays_on=True)
@@ -391,16 +386,11 @@ class Radiography:
         before: Before = (),
         trapped: Float32Array | None = None,
     ) -> ideal.Counts:
-        """Compute the counts that the camera saves of a radiograph.
+        """Compute the counts that the camera saves of a radiograph, uint16 (rows, cols).
 
-        For ideal physics `before` and `trapped` are not used. Earlier frames without expected
-        counts are skipped.
-
-        `radiograph`: without noise. `camera`: mode and region. `exposure`: tube and time; X-rays
-        off give a dark image, whatever the radiograph. `rng`: generator of the frame's noise;
-        None for the expectation. `before`: earlier frames, each with the time since its end [s].
-        `trapped`: electrons in traps, (rows, cols); None for none.
-        Returns uint16 (rows, cols).
+        X-rays off give a dark image. `rng`: of the noise; None for the expectation.
+        `before`: earlier frames, with the time since their end [s]; `trapped`: electrons
+        in traps. Ideal physics uses neither.
         """
         expected = radiograph.expected
         if expected is None:
@@ -523,15 +513,11 @@ def predictors() -> Workers:
 def predict(
     phantom: Phantom, machine: Machine, settings: dict[str, Any], codec: Codec
 ) -> list[bytes]:
-    """Answer `exposure.predict`, in the worker.
+    """Answer `exposure.predict`, in the worker, as encoded pieces.
 
-    The forecast's `images` are sent as `frames`, with the sample's name added. At most
-    `MAX_PROPOSALS` settings of the best; the infinite last edge of the histogram is left out.
-
-    `phantom`: the sample; `machine`: the twin's; `settings`: arguments of `expose`; `codec`: of
-    the answer.
-    Returns the encoded answer, in pieces.
-    Raises RpcError: an argument that the machine does not allow.
+    The forecast's `images` are sent as `frames`. At most `MAX_PROPOSALS` of the best; the
+    infinite last edge is left out. `settings`: of `expose`. Raises RpcError: an argument
+    beyond the machine.
     """
     answer = asdict(exposure_forecast.expose(phantom, machine=machine, **settings))
     answer["transmission"]["edges"] = answer["transmission"]["edges"][

@@ -74,13 +74,10 @@ class Batch:
         answer: m.Response | m.Failure | None,
         encode: Callable[[m.Response | m.Failure], list[bytes]],
     ) -> None:
-        """Keep the answer to the item that was taken out last; nothing for None (a
-        notification).
+        """Keep the answer to the item that was taken out last; None for a notification.
 
-        An answer that would make the batch too large is replaced by an error, which counts with
-        the size of that answer: so the batch is full from then on.
-
-        `answer`: to the item; `encode`: gives the pieces of an answer.
+        One that would make the batch too large becomes an error, which counts with the
+        size of that answer.
         """
         if answer is None:
             return

@@ -18,10 +18,10 @@ class Deadlines:
         self._timers: dict[str, asyncio.TimerHandle] = {}
 
     def start(self, name: str, seconds: float | None) -> None:
-        """Start a timeout, after which `on_timeout` is called once with name and seconds.
+        """Start a timeout that calls `on_timeout` with name and seconds (None: none).
 
-        Nothing if `seconds` is None, or if a timeout of that name has been started and
-        not stopped, even one that has passed."""
+        Nothing if that name's has not been stopped.
+        """
         if seconds is not None and name not in self._timers:
             self._timers[name] = asyncio.get_running_loop().call_later(
                 seconds, self._on_timeout, name, seconds

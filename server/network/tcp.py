@@ -117,9 +117,10 @@ class TcpServer(ListeningServer):
         return _Link(self)
 
     def look_soon(self, link: _Link) -> None:
-        """Schedule a search for urgent requests of a connection, in turns that no flood can
-        fill. A connection is in the list once, in the order of first calls. The search is made
-        in the loop's next round, by `_start_urgent`."""
+        """Schedule a search for a connection's urgent requests in the loop's next round.
+
+        A connection is in the list once.
+        """
         self._unexamined[link] = None
         if not self._examination_due:
             self._examination_due = True
@@ -300,15 +301,11 @@ class _Link(asyncio.BufferedProtocol):
         self.worker.add_done_callback(self._crashed)
 
     def _take_place(self) -> bool:
-        """Give the connection a place if one is free, else a reserved one, for urgent
-        requests alone.
+        """Give the connection a place if one is free; return whether it has one of its
+        own.
 
-        There are `max_clients` places and `RESERVED_PLACES` reserved ones, where a new
-        connection may displace an older one. It leaves the waiting room in any case.
-        Nothing changes if it has a place.
-
-        Returns:
-            Whether it has a place of its own.
+        Else it gets a reserved one, for urgent requests alone, where a new connection may
+        displace an older one. It leaves the waiting room.
         """
         server = self.server
         if self in server.links:
@@ -522,7 +519,7 @@ class _Link(asyncio.BufferedProtocol):
     ) -> None:
         """Log a line about this connection, unless there were too many of its kind.
 
-        Lines of connections that are not admitted are counted as a kind of their own.
+        Before admission that is a kind of its own.
         """
         kind = event
         if not self.let_in:
@@ -640,10 +637,7 @@ class _Link(asyncio.BufferedProtocol):
             self.out.reply(m.Failure(None, errors.parse_error(str(error))))
 
     def _light(self, raw: bytes) -> bool:
-        """Return whether a large message takes little time to decode: JSON of few values,
-        most of it white space or one text.
-
-        No process has to be started for it, which takes a second."""
+        """Return whether a large message decodes quickly: JSON of few values."""
         return (
             self.codec is Codec.JSON
             and sum(map(raw.count, (b",", b"[", b"{"))) <= MAX_LIGHT_VALUES
@@ -967,11 +961,10 @@ class _Link(asyncio.BufferedProtocol):
 
     @property
     def _full(self) -> bool:
-        """Whether so much waits that reading pauses: messages, or bytes received ahead.
+        """Whether reading pauses, as `max_waiting` messages or too many bytes wait.
 
-        `max_waiting` messages; more than `READ_AHEAD_BYTES` (`MAX_INLINE_BYTES` before
-        admission). Of an admitted client only bytes of whole messages count, so that an
-        incomplete one, which may be urgent, is completed behind others."""
+        Of an admitted client only whole messages count: an incomplete one may be urgent.
+        """
         if self.let_in:
             ahead, limit_bytes = self.wire.pending_whole, READ_AHEAD_BYTES
         else:
@@ -988,10 +981,7 @@ class _Link(asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def _done(self, task: asyncio.Task[Any]) -> None:
-        """Remove an ended task, report its error if it crashed, and resume reading if
-        possible.
-
-        Reading is left alone once the connection is gone."""
+        """Remove an ended task, report a crash, and resume reading."""
         self.tasks.discard(task)
         self._crashed(task)
         if not self.gone.is_set():

@@ -177,11 +177,10 @@ class ComputeThread:
 def projection_steps(
     body: Body, rows: npt.NDArray[np.float64], shape: tuple[int, int], block: int
 ) -> Iterator[Step]:
-    """Yield functions that each project a block of views, for the compute thread.
+    """Yield functions that each project a block of views, (views, rows, cols).
 
-    `body`: volume, mesh or scene; `rows`: cone_vec (n, 12); `shape`: detector (rows, cols);
-    `block`: views of a step.
-    Yields steps whose values are float32 (views, rows, cols)."""
+    `rows`: cone_vec (n, 12); `shape`: (rows, cols) of the panel.
+    """
 
     def step(part: npt.NDArray[np.float64]) -> Step:
         """Make the step of some rows."""
@@ -198,11 +197,10 @@ def marking_steps(
     block: int,
     need: tuple[Need, float],
 ) -> Iterator[Step]:
-    """Yield functions that each find the rays that the pixels of a block of views need.
+    """Yield functions that each find the rays that a block's pixels need.
 
-    `body` and `rows` and `shape` and `block`: as of `projection_steps`; `need`: and the body's
-    weight, as of `rays_needed`.
-    Yields steps whose values are uint32, see `pixel_areas.packed`."""
+    As `projection_steps`; `need`: with the body's weight. Values: `pixel_areas.packed`.
+    """
 
     def step(part: npt.NDArray[np.float64]) -> Step:
         """Make the step of some rows."""

@@ -115,11 +115,7 @@ class Context:
         return await client.begin(id).run(self.compute, step)
 
     def supersede(self, client: JobClient, key: str) -> None:
-        """End this client's jobs of that key that still wait, with an error, and count
-        them in `superseded`.
-
-        Running ones go on.
-        """
+        """End this client's waiting jobs of that key with an error, and count them."""
         for job in client.jobs.values():
             if job.key == key and job.waits:
                 job.end(superseded(key))

@@ -346,11 +346,9 @@ def _document() -> object:
 def _accumulator(
     context: Context, name: str | None, grid: wire.VoxelGrid
 ) -> Volume | None:
-    """Look up the volume called `name`, to which a back projection is to be added.
+    """Look up the volume `name`, to which a back projection is to be added; else None.
 
-    Only the shape is compared, not voxel size and place.
-    Returns the volume; None without a name or if there is no such volume.
-    Raises RpcError: -32602, it is a mesh or a scene, or has another shape than `grid`.
+    Raises RpcError: -32602, it is no volume, or has another shape than `grid`.
     """
     if name is None or name not in context.store:
         return None

@@ -85,10 +85,10 @@ class VolumeStore:
         return self._evictable_bytes
 
     def get(self, name: str) -> Body:
-        """Look up the volume called `name`, which becomes the most recently used.
+        """Look up the volume `name`, which becomes the most recently used.
 
-        Returns the volume, mesh or scene itself, not a copy.
-        Raises RpcError: -32602, there is none; as `unknown_volume`."""
+        Raises RpcError: -32602, there is none.
+        """
         if name not in self._held:
             raise wire.unknown_volume(name, list(self._held))
         value = self._held[name] = self._held.pop(name)
@@ -97,11 +97,9 @@ class VolumeStore:
     def put(self, name: str, value: Body, *, evictable: bool = False) -> None:
         """Store a complete volume, mesh or scene under `name`, in place of its namesake.
 
-        It becomes the most recently used. Evictable volumes are removed for it where memory is
-        needed.
-        `name`: of the volume. `value`: volume, mesh or scene; not copied. `evictable`: whether
-        it may be forgotten where memory is needed.
-        Raises RpcError: -32008, above the memory limit."""
+        It becomes the most recently used. Evictable ones are removed where memory is
+        needed. Raises RpcError: -32008, too large.
+        """
         self.reserve(f"volume {name!r}", memory_of(value), name)
         self.remove(name)
         self._held[name] = value

@@ -109,11 +109,9 @@ class FrameLink(asyncio.BufferedProtocol):
         self.on_made(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        """Return the memory for the next bytes: the rest of the four length bytes, or of
-        the frame's body.
+        """Return the memory for the next bytes: of the length, or of the frame's body.
 
-        Once nothing more is to be read it is memory of its own, to be ignored. `sizehint`
-        is ignored.
+        At the end it is memory to be ignored.
         """
         if self._over:
             return memoryview(bytearray(SLICE_BYTES))
@@ -179,10 +177,7 @@ class FrameLink(asyncio.BufferedProtocol):
         return False
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Note the end of the connection, cancel its deadlines, wake whoever waits to
-        write, and call `on_lost`.
-
-        `exc` is ignored."""
+        """Note the end of the connection, wake whoever waits, call `on_lost`."""
         self.lost = True
         self.deadlines.clear()
         self._writable.set()
@@ -222,11 +217,10 @@ class FrameLink(asyncio.BufferedProtocol):
 
     def dismiss(self, message: m.Message) -> None:
         """Send a last message and end the connection; bytes that still arrive are
-        discarded.
+        dropped.
 
-        The sending side is closed at once, the connection at most `MAX_LAST_WORD_S`
-        later: closing it with bytes unread would reset it and lose the message. With TLS
-        it is closed at once. Nothing happens if the connection has ended.
+        It is closed `MAX_LAST_WORD_S` later at most, as closing with bytes unread would
+        reset it and lose the message; with TLS at once.
         """
         self._over = True
         if self.lost or self.transport.is_closing():

@@ -228,14 +228,11 @@ class Acquisition:
         before: Sequence[Before],
         trapped: Sequence[Float32Array | None],
     ) -> None:
-        """Convert images to counts and write each frame's file.
+        """Convert the images of a batch to counts and write each frame's file.
 
-        Noise depends on the seed and the frame's number; without a seed there is none.
-
-        `batch`: frames with files. `images`: one for each frame. `before`: earlier frames on the
-        panel, for each frame. `trapped`: charge in the panel's traps (rows, cols), for each
-        frame; None without traps.
-        Raises DatasetWriteError: as `put`; the files before are there.
+        Noise depends on the seed (None: none) and the frame's number. `before`: earlier
+        frames; `trapped`: charge in traps (rows, cols). Raises DatasetWriteError: as
+        `put`.
         """
         for frame, image, earlier, traps in zip(
             batch, images, before, trapped, strict=True

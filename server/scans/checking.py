@@ -103,14 +103,12 @@ class CheckInput:
         return len(self.source.poses.text) <= LIGHT_BYTES
 
     def report(self, bytes_at_most: int | None = None, swept: bool = True) -> CheckReport:
-        """Parse, plan and check the scan, with a sweep for collisions where the machine has
-        components; blocks.
+        """Parse, plan and check the scan, `swept` for collisions if there are components;
+        blocks.
 
-        Moves between poses go around obstacles if collisions are swept.
-        `bytes_at_most`: largest size of the report; None for no limit. It holds for a swept
-        report only. `swept`: whether collisions are looked for.
-        Returns the dry-run report; problems of the scan are in it, not raised.
-        Raises RpcError: -32008, the report would be larger than that; nothing is swept then.
+        Moves between poses then go around obstacles. `bytes_at_most`: of a swept report.
+        Problems of the scan are in it. Raises RpcError: -32008, it would be larger;
+        nothing is swept then.
         """
         report = self._report(bytes_at_most, swept)
         if report.plan.duration_s <= self.clock_left_s:

@@ -51,11 +51,11 @@ class Retry:
         return max(0.0, self._at - asyncio.get_running_loop().time())
 
     def schedule(self, error: Exception, go: Callable[[], None]) -> None:
-        """Schedule a call of `go` after a pause; nothing changes if a call is pending.
+        """Schedule a call of `go` after a pause, unless one is pending.
 
-        The pause is `first_s`, doubles with each attempt, and is at most `longest_s`.
-        `error`: for which it waits: after a full disk `go` is called only once there is room;
-        `go`: resumes the job."""
+        It doubles from `first_s` to `longest_s`. If `error` is a full disk, `go` waits
+        for room.
+        """
         if self.waits_s is None:
             pause = min(self._longest, self._first * 2.0**self._attempts)
             self._attempts += 1
@@ -68,9 +68,7 @@ class Retry:
             self._attempts = 0
 
     def cancel(self) -> None:
-        """Cancel the next attempt and reset the pause: a user takes over, or the job has
-        ended.
-        """
+        """Cancel the next attempt and reset the pause, as a user takes over."""
         if self._task is not None:
             self._task.cancel()
             self._task = None

@@ -145,11 +145,9 @@ class Jobs:
 
     @property
     def busy(self) -> bool:
-        """True while the current job runs and makes frames or opens, or runs at speed
-        "max".
+        """Whether the current job makes frames or opens, or runs at "max".
 
-        False for a paused or waiting job, and one that waits between frames at another
-        speed.
+        Not if it is paused, or waits between frames.
         """
         job = self.current
         if job is None or job.phase != "running":
@@ -346,20 +344,20 @@ class Jobs:
         return job
 
     def pause(self, job: Job) -> None:
-        """Pause a running job; one that is paused stays so.
+        """Pause a running job, and cancel a planned retry.
 
-        A planned retry is canceled: only `resume` continues the job.
-        Raises RpcError: -32003, it neither runs nor is paused."""
+        Raises RpcError: -32003, it does not run.
+        """
         runner = self._runner(job, "pause", ("running", "paused"))
         self._take_over()
         runner.pause()
         self._tell(job)
 
     def resume(self, job: Job) -> None:
-        """Let a paused job go on; nothing changes for one that runs but that a planned retry is
-        canceled.
+        """Let a paused job go on, and cancel a planned retry.
 
-        Raises RpcError: -32003, it neither runs nor is paused."""
+        Raises RpcError: -32003, it does not run.
+        """
         runner = self._runner(job, "resume", ("running", "paused"))
         self.retry.cancel()
         self._manual = False
@@ -374,16 +372,11 @@ class Jobs:
         runner.step()
 
     def abort(self, job: Job, reason: str | None = None, by: str | None = None) -> None:
-        """End a job in any phase; its data set stays, incomplete, with the reason.
+        """End a job; its data set stays, incomplete, with the reason.
 
-        A waiting job ends at once, a running one at its next wait, with X-rays off. One
-        that is being opened stays queued until its data set is marked incomplete, and does
-        not run. The first requester stays `ended_by`.
-
-        Args:
-            job: to end; one that has ended stays as it is.
-            reason: for the data set.
-            by: connection of the request.
+        A waiting job ends at once, a running one at its next wait. One being opened stays
+        queued until its data set is marked, and does not run. `by`: connection of the
+        request; the first one stays `ended_by`.
         """
         if job.phase in ENDED_PHASES:
             return
@@ -401,12 +394,11 @@ class Jobs:
             self._tell(job)
 
     def interrupt(self, reason: Exception) -> None:
-        """Pause the current job after a stop from outside (stop, E-stop), also one that is being
-        opened or resumed.
+        """Pause the current job after a stop from outside, also while it is opened or
+        resumed.
 
-        A planned retry is canceled; only `resume` continues the job. A paused job stays paused,
-        with its reason.
-        `reason`: shown as the job's error.
+        A retry is canceled. A paused job keeps its reason. `reason`: shown as the job's
+        error.
         """
         self._take_over()
         self._interrupted = reason
@@ -452,14 +444,11 @@ class Jobs:
         return [job for job in jobs if job.id not in forgotten]
 
     def recall(self, jobs: Sequence[JobMemory], made: int, root: Directory) -> list[Job]:
-        """Restore the jobs of an earlier server; those that had not ended are incomplete now.
+        """Restore the jobs of an earlier server; return those that had not ended.
 
-        None of them runs by itself. Changed jobs are noted for the next write, and the oldest
-        ones beyond the limits forgotten.
-
-        `jobs`: records of the jobs, oldest first; `made`: number of jobs ever made, from which
-        new ids continue; `root`: data directory.
-        Returns the jobs that had not ended.
+        These are incomplete now, and none runs by itself. Changes are noted, and the
+        oldest beyond the limits forgotten. `made`: jobs ever made, from which ids
+        continue.
         """
         self._count = max(self._count, made, *(number_of(memory.id) for memory in jobs))
         left = []
@@ -473,12 +462,10 @@ class Jobs:
         return left
 
     def ended(self, job: str | None, min_age: timedelta) -> list[Job]:
-        """Select the ended jobs to be forgotten; nothing is removed here.
+        """Select the ended jobs to be forgotten: one, or all that ended `min_age` ago.
 
-        `job`: its id; None for all that ended long enough ago. `min_age`: least time since their
-        end; not used for a named job.
-        Raises UnknownNameError: there is no such job; RpcError: -32003, the named one has not
-        ended."""
+        Raises UnknownNameError: no such job; RpcError: -32003, it has not ended.
+        """
         if job is None:
             return self._ended_for(min_age)
         found = self.get(job)
@@ -487,10 +474,7 @@ class Jobs:
         return [found]
 
     def forget(self, jobs: Iterable[Job]) -> None:
-        """Remove these jobs from the list and note the change; their data sets stay.
-
-        Jobs that are not in it are skipped.
-        """
+        """Remove these jobs from the list; their data sets stay."""
         for job in jobs:
             if self._all.get(job.id) is job:
                 del self._all[job.id]
@@ -709,10 +693,7 @@ class Jobs:
         return job.runner
 
     def _phase_error(self, what: str, job: Job, phases: tuple[JobPhase, ...]) -> RpcError:
-        """Make the error -32003 for a command that a job's phase does not allow; returned, not
-        raised.
-
-        `what`: the command; `job`: to which it was given; `phases`: in which it is allowed."""
+        """Make (do not raise) the error -32003: a job's phase does not allow `what`."""
         return busy(
             f"cannot {what} {job.id}: it is {job.phase}",
             {"asked": what, "state": job.phase, "allowed": list(phases)},

@@ -92,10 +92,9 @@ def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Re
 def _remaining(
     trajectories: tuple[tuple[float, Trajectory], ...], tau: float
 ) -> tuple[Trajectory, ...]:
-    """Select an axis's motion from plan time `tau` on; a trajectory under way is cut there.
+    """Select an axis's motion from plan time `tau` [s] on; one under way is cut there.
 
-    `trajectories`: pairs of start [s] and trajectory, by time; `tau`: on the plan's clock [s].
-    Returns trajectories on the plan's clock; () once all have ended.
+    `trajectories`: (start [s], trajectory), by time.
     """
     begun = [t for time, t in trajectories if time <= tau]
     later = tuple(t for time, t in trajectories if time > tau)

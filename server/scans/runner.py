@@ -193,11 +193,10 @@ class ScanRunner:
         self._wake()
 
     def step(self) -> None:
-        """Request one frame, or one command that lasts, after which the run pauses again;
-        a shown error is cleared.
+        """Request one frame or lasting command, then a pause.
 
-        Requests before the run obeys are one step. A request while a frame waits for room
-        counts for the next frame."""
+        Requests before the run obeys are one.
+        """
         self._pause = False
         self._single_step = True
         self._steps += 1
@@ -205,11 +204,7 @@ class ScanRunner:
         self._wake()
 
     def abort(self, reason: str | None = None) -> None:
-        """Request the end of the run: it raises `JobAborted` at its next wait.
-
-        What had paused it is not why it ends, and leaves `progress`.
-        `reason`: for the error; None keeps an earlier one.
-        """
+        """Request the end of the run: it raises `JobAborted` at its next wait."""
         if reason is not None:
             self._end = JobAborted(reason)
         self._abort = True
@@ -307,9 +302,7 @@ class ScanRunner:
         return self.plan.duration_s
 
     def _not_made(self, error: Exception) -> None:
-        """Handle a batch that failed: pause with an error that may pass, or end the run
-        with one that the same frames would meet again.
-        """
+        """Pause after a failed batch, or end the run if it is hopeless."""
         if hopeless(error):
             self._end = error
             self.abort()
@@ -334,13 +327,7 @@ class ScanRunner:
         return self._numbers[frame.index]
 
     def recount(self, present: Collection[str]) -> None:
-        """Set the number of finished projections to those that the data set has.
-
-        A batch that the end of the run cut short is stored in part.
-
-        Args:
-            present: names of the images of the data set.
-        """
+        """Set the number of finished projections to those in the data set."""
         stored = [e for e in self._frames if e.kind == "projection" and e.file in present]
         self._set_progress(frames_done=len(stored))
 

@@ -97,15 +97,10 @@ class ScanSource:
         seed: int | None = None,
         flat: bool | Mapping[str, float] = True,
     ) -> ScanSource:
-        """Make a scan from a trajectory; its script is a comment on exposure and flats,
-        then one for each pose.
+        """Make a scan from a trajectory; its script is a comment on it, and one a pose.
 
-        Args:
-            poses: axis -> value [mm, deg] of each pose, or a list made before.
-            exposure_ms: of each image; None for the camera's.
-            moments: poses averaged within an exposure in motion.
-            seed: of the noise; None for a fresh one.
-            flat: whether flats are taken, or the pose of them.
+        `poses`: axis -> [mm, deg]; `exposure_ms`: None: the camera's; `moments` averaged
+        in an exposure; `flat`: taken, or their pose.
         """
         if not isinstance(poses, PoseList):
             poses = PoseList.of(poses)

@@ -165,10 +165,7 @@ class Stage:
         parameters: Offsets = NOMINAL,
         upload: ReceivedSample | None = None,
     ) -> Guard | None:
-        """Create the guard that sweeps every motion; None for a machine without components.
-
-        `sample`: on the stage; `parameters`: applied correction; `upload`: as for `pieces`.
-        """
+        """Create the guard that sweeps every motion; None without components."""
         scene = self.scene(sample, parameters, upload)
         if scene is None:
             return None
@@ -256,9 +253,7 @@ class ObstacleMoves:
     _commands: int = 0
 
     def cancel(self) -> None:
-        """Stop planning and start no further leg, for another command; the present leg
-        ends normally.
-        """
+        """Stop planning and start no further leg; the present one ends."""
         self._commands += 1
         if self._task is not None:
             self._task.cancel()

@@ -89,10 +89,10 @@ class TwinClock:
         return self._speed_up
 
     def set_speed_up(self, speed_up: SpeedUp) -> None:
-        """Run faster or slower from now on.
+        """Run faster or slower from now on, without a jump.
 
-        The present time does not jump; the next wake-up is scheduled anew. `speed_up`: "max", or
-        above 0 and at most `MAX_SPEED_UP`. Raises LimitError: another one; nothing changes."""
+        Raises LimitError.
+        """
         checked = check_speed_up(speed_up)
         self._rebase()
         self._speed_up = checked
@@ -122,9 +122,8 @@ class TwinClock:
     def at(self, moment: float) -> asyncio.Future[None]:
         """Return a future that is done once the clock has reached `moment` [s].
 
-        It is done at once for a moment that has passed. Futures of equal moments end in
-        the order of the calls. Its owner may finish or cancel it early; the clock then
-        drops it.
+        Futures of equal moments end in the order of the calls. One that its owner
+        finishes early is dropped.
         """
         future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         if self._time() >= moment:

@@ -188,11 +188,9 @@ class Corrections:
         )
 
     def after(self, correction: NamedCorrection | None) -> History:
-        """Return the history once `correction` (None: none) is in force instead of the
-        last; nothing is changed here.
+        """Return the history once `correction` (None: none) is in force; changes nothing.
 
-        It is the same list if none is in force before and after. Names beyond the last
-        `MAX_HISTORY` are dropped.
+        Only the last `MAX_HISTORY` names stay.
         """
         name = None
         if correction is not None:
@@ -204,12 +202,10 @@ class Corrections:
     def store(
         self, changes: documents.Changes, correction: NamedCorrection, source: str | None
     ) -> None:
-        """Add the file of a new correction to `changes`; nothing is added for a known name.
+        """Add the file of a new correction to `changes`; nothing for a known name.
 
-        `get` and `all` do not have it before `know`.
-        `changes`: written together; `correction`: to be stored; `source`: data set or file that
-        it came from, or None.
-        Raises DatasetWriteError: the system cannot write.
+        `get` and `all` do not have it before `know`. `source`: of the correction. Raises
+        DatasetWriteError.
         """
         if correction.name in self._all:
             return
@@ -261,10 +257,7 @@ class Corrections:
         changes.remove(self._folder, self._files.get(name) or _file(self._all[name]))
 
     def forget(self, name: str, history: History) -> None:
-        """Remove a correction from memory and set the history; its file is removed by `remove`.
-
-        `name`: of the correction; it must be known. `history`: the one without it.
-        """
+        """Remove a known correction from memory; `remove` deletes its file."""
         del self._all[name]
         self._sources.pop(name, None)
         self._files.pop(name, None)
@@ -290,12 +283,10 @@ def _file(correction: NamedCorrection) -> str:
 
 
 def _joined(before: History, in_force: History) -> History:
-    """Join the history of the file with that of the state, whose last name is in force.
+    """Join the history of the file with that of the state, the last name in force.
 
-    A history of none or several names in the state replaces the file's. A single name cuts the
-    file's history after its last place there, or is appended.
-
-    `before`: of the file; `in_force`: of the state: a whole history, or the one name in force.
+    A single name cuts the file's after its last place there, or is appended; none or
+    several replace it.
     """
     if len(in_force) != 1:
         return in_force

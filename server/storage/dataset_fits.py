@@ -85,15 +85,7 @@ def align(
 ) -> p.CalibrationAlignResult:
     """Align a data set for `calibration.align`; blocks, for a worker process.
 
-    Args:
-        root: the data directory.
-        asked: parameters of `calibration.align`.
-
-    Returns:
-        The alignment's document; paths are relative to the data directory.
-
-    Raises:
-        TwinError: there is no such data set, or nothing can be aligned.
+    Paths are relative to `root`. Raises TwinError: no such data set, or nothing to align.
     """
     from flexdt.library.analysis import align as align_data_set
 

@@ -145,13 +145,10 @@ class DatasetWriter:
             self._present.add(name)
 
     def finish(self, *, duration_s: float | None = None) -> None:
-        """Check that all images are there, and mark the data set complete: write its texts anew,
-        after the images are safe on the disk.
+        """Mark the data set complete, once all images are safe on the disk.
 
-        The folder is held until `close`.
-        `duration_s`: of the scan as it ran [s]; None keeps the planned one.
-        Raises DatasetMissingError: an image is not there; the data set stays incomplete;
-        DatasetWriteError: the system cannot write.
+        `duration_s`: of the scan as it ran [s]; None: as planned. Raises
+        DatasetMissingError: an image is not there; DatasetWriteError.
         """
         missing = self.missing
         if missing:

@@ -368,11 +368,9 @@ def _same(a: Content, b: Content) -> bool:
 
 
 def _within(machine: Machine, positions: dict[str, float]) -> dict[str, float]:
-    """Limit positions to the travel of their motors, as rounding may have brought them out.
+    """Limit positions to motors' travel, as of rounding.
 
-    `machine`: whose motors; positions of others are left out. `positions`: motor -> position
-    [mm, deg].
-    Returns motor -> position [mm, deg].
+    Other motors are left out.
     """
     axes = machine.axes
     return {

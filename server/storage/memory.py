@@ -98,11 +98,9 @@ def remember(
 ) -> Memory:
     """Make the document of the scanner at twin time `now`.
 
-    It has rates, tube, camera, sample and correction, the time of writing, and the arguments.
-
-    `scanner`: as it is; `now`: twin time [s]; `record`: of the journal, now; `made`: jobs there
-    ever were; `corrections`: as `Memory` has them; `unfiled`: jobs of an earlier server that
-    could not be given files yet; `ended`: whether the server has ended.
+    `record`: of the journal; `made`: jobs there ever were; `corrections`: as `Memory` has
+    them; `unfiled`: jobs of an earlier server that have no files yet; `ended`: the server
+    has ended.
     """
     scene = save_scene(scanner, now).model_copy(update={"positions": record.positions})
     return Memory(

@@ -426,23 +426,13 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
 def _list(
     root: Directory, asked: p.DatasetList, context: TwinContext, codec: Codec
 ) -> p.DatasetListResult:
-    """Answer dataset.list: the data sets that match the search, newest first, from
-    `start` on and at most `count`.
+    """Answer dataset.list: the data sets that match the search, newest first.
 
-    All words of the search must be in name, state, sample, operator, machine, mode, start
-    or settings, whatever the case. Of at most `MAX_SETS` folders summaries are read or
-    taken from the cache; those for which `LIST_S` was too short are listed as not read
-    yet. Folders that hold no data set are skipped.
-
-    Args:
-        root: data directory.
-        asked: search, range and largest side of thumbnails.
-        context: name of the running data set.
-        codec: of the connection, not used.
-
-    Returns:
-        The rows, the number that match, that of unread ones, and `left_out`: folders
-        beyond `MAX_SETS` or with a bad name.
+    All words must be in name, state, sample, operator, machine, mode, start or settings,
+    whatever the case. Of at most `MAX_SETS` folders summaries are read or cached; those
+    for which `LIST_S` was too short are listed as not read yet. Others are skipped.
+    Returns `count` rows from `start` on, the numbers that match and are unread, and
+    `left_out`: folders beyond `MAX_SETS` or with a bad name.
     """
     folders, left_out = _folders(root)
     words = asked.search.lower().split()

@@ -140,16 +140,10 @@ class Incoming:
             return known.received, known
 
     def take(self, upload: Upload) -> tuple[UploadHead, bytes]:
-        """Read a complete upload, and remove it and its file; it is removed, too, if reading
-        fails.
+        """Read a complete upload, and remove it and its file, even if reading fails.
 
-        Args:
-            upload: as `receive` told it: of the requester, whoever has sent another under
-                its name since.
-
-        Returns its description and its bytes.
-        Raises LimitError: it is not complete, as when another one was begun under its name;
-        DatasetWriteError: its file cannot be read.
+        `upload`: as `receive` told it. Raises LimitError: it is not complete, as when
+        another one was begun under its name; DatasetWriteError: its file cannot be read.
         """
         with self._lock:
             name = upload.head.name

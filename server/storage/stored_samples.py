@@ -169,18 +169,13 @@ class SampleStore:
         return _shown(head, revision)
 
     def load(self, name: str, material: str | None = None) -> Phantom:
-        """Return the phantom called `name` from the cache, or parse it and cache it; blocks.
+        """Return the phantom called `name` from the cache, or parse it and cache it;
+        blocks.
 
-        Two threads may parse the same one at once; the last result is kept.
-
-        Args:
-            name: a shipped phantom's or an upload's.
-            material: instead of the one a mesh was uploaded with.
-
-        Returns the phantom, the same object until another file comes under the name.
-        Raises UnknownNameError: no such sample or material; LimitError: a material for a sample
-        that has its own; PhantomError: an upload that cannot be read any more; if its bytes are
-        damaged it is removed from the list.
+        `material`: instead of the one a mesh was uploaded with. Raises UnknownNameError:
+        no such sample or material; LimitError: a material for a sample that has its own;
+        PhantomError: an upload cannot be read any more; if damaged it is removed from the
+        list.
         """
         key = (name, material)
         with self._lock:
@@ -285,12 +280,9 @@ class SampleStore:
     ) -> ReceivedSample:
         """Parse a complete upload, which may take seconds; nothing is stored.
 
-        It is removed from the uploads under way, so a second call fails.
-
-        `complete`: the upload, as `receive` told it. `material`: also parse it of this material,
-        in which it is on the stage; None: not. `observer`: whether another client has control.
-        Raises PhantomError, UnknownNameError: its content does not hold; LimitError: observers
-        have sent too much meanwhile.
+        It is removed from the uploads under way. `material`: in which it is on the stage;
+        None: not. `observer`: another client has control. Raises PhantomError,
+        UnknownNameError; LimitError: observers have sent too much.
         """
         head, raw = self._incoming.take(complete)
         head = head.model_copy(update={"observer": observer})
@@ -305,10 +297,7 @@ class SampleStore:
     def prepare(self, upload: ReceivedSample) -> None:
         """Write an upload's bytes, before any lock; `store` makes them visible.
 
-        The file is named after its content, and nothing refers to it yet: unless `know`
-        is called, `tidy` deletes it.
-
-        Raises DatasetWriteError: the system cannot write.
+        Unless `know` is called, `tidy` deletes the file. Raises DatasetWriteError.
         """
         name = upload.head.name
         file = _bytes_file(name, upload.revision)
@@ -502,16 +491,9 @@ def _shown(head: UploadHead, revision: str) -> str:
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
     """Parse the bytes of an upload: mesh or scene in a worker process, voxels here.
 
-    Args:
-        head: description of the upload.
-        raw: its bytes.
-        material: of a mesh (None: `DEFAULT_MATERIAL`), or that fills voxels (None:
-            attenuation as uploaded); not used for a scene.
-
-    Raises:
-        PhantomError: voxels of another size, or not finite; a mesh or scene that cannot
-            be read.
-        UnknownNameError: no such material.
+    `material`: of a mesh (None: `DEFAULT_MATERIAL`), or that fills voxels (None:
+    attenuation). Raises PhantomError: it cannot be read, voxels of another size, or not
+    finite; UnknownNameError.
     """
     match head.kind:
         case "mesh":
@@ -576,14 +558,9 @@ def _head_of(file: str) -> Callable[[bytes], UploadHead]:
 
 
 def sample_material(head: UploadHead | None, material: str | None) -> str | None:
-    """Choose the material that an uploaded mesh is filled with: the requested one, else that of
-    its description, else `DEFAULT_MATERIAL`.
+    """Choose an uploaded mesh's material: requested, described, or `DEFAULT_MATERIAL`.
 
-    Args:
-        head: description of the upload; None for a shipped phantom.
-        material: requested with the sample, if any.
-
-    Returns name of the material; None for a sample that is no mesh.
+    None for a sample that is no mesh.
     """
     if head is None or head.kind != "mesh":
         return None

@@ -97,9 +97,10 @@ class TwinSession:
         self._twin.feed.changed()
 
     def _take_control(self, what: str) -> None:
-        """Take control for the client if nobody holds it, and renew its lease; the state is
-        published only if the controller has changed. `what`: method, for the error. Raises
-        RpcError: -32003, another client is the controller."""
+        """Take control for the client if it is free, and renew its lease.
+
+        Raises RpcError: -32003.
+        """
         before = self._twin.control.holder
         self._twin.control.require(self._client.name, what)
         if before != self._twin.control.holder:

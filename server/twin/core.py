@@ -109,12 +109,11 @@ class ControlLease:
             self._heard = self._clock()
 
     def require(self, who: str, what: str) -> None:
-        """Check that `who` may move: it has control already, or takes it because it is free.
+        """Check that `who` may move, or give it control if that is free (unheard for
+        `idle_s`).
 
-        Control is free without a holder, or after `idle_s` without a request of the holder. The
-        lease of `who` is renewed.
-        `who`: name of the client's connection; `what`: method, for the error.
-        Raises RpcError: -32003, another client is the controller."""
+        Renews the lease. Raises RpcError: -32003, another client is the controller.
+        """
         expired = self._clock() - self._heard > self._idle_s
         if self.holder is None or expired:
             self.holder = who

@@ -49,11 +49,10 @@ class _Event:
         data: object | Render,
         slot: str | None,
     ) -> None:
-        """Make an event of topic `topic`, number `seq`, at twin time `time` [s].
+        """Make an event, number `seq`, at twin time `time` [s].
 
-        `data` is the content or a function from a view to the content. A newer event of
-        the same slot replaces a pending one; slots of different topics are different.
-        With `slot` None every event is delivered.
+        `data` may be a function from a view to the content. A newer event of the slot
+        replaces a pending one, but not if `slot` is None.
         """
         self.topic = topic
         self.seq = seq
@@ -261,13 +260,11 @@ class Hub:
         data: object | Render,
         slot: str | None = "",
     ) -> None:
-        """Send one subscriber of `topic` the present data, out of turn, with the number of the
-        last event.
+        """Send one subscriber of `topic` the present data, with the last event's number.
 
-        Nothing is sent if it is not subscribed. Other subscribers, the history, the numbers and
-        the rate are not touched. Before the first event the number is 0.
-        `listener`: who has just subscribed; `topic`: of the event; `data`: as for `publish`;
-        `slot`: as for `publish`."""
+        Others, the history, the numbers and the rate are not touched; 0 before the first
+        event.
+        """
         subscription = self._listeners.get(topic, {}).get(listener)
         if subscription is not None:
             # Not a number of its own: to all other subscribers that would be a gap.
@@ -341,9 +338,7 @@ class Hub:
             asyncio.get_running_loop().call_soon(self._refill)
 
     def _refill(self) -> None:
-        """Allow `EVENTS_A_TURN` events in a new turn of the loop, and deliver those that are
-        due.
-        """
+        """Allow `EVENTS_A_TURN` events in a new turn, and deliver those due."""
         self._room = EVENTS_A_TURN
         self._refilling = False
         if self._due_events:

@@ -68,11 +68,7 @@ class Shot:
     def of(cls, scanner: ScannerTwin, now: float, revision: str | None = None) -> Shot:
         """Read from the scanner the state at `now` [twin s] on which an image depends.
 
-        Args:
-            scanner: its positions of all motors, sorted by name, camera, sample, tube and
-                correction are taken.
-            now: time of the positions.
-            revision: of the content of an uploaded sample; None if unknown.
+        `revision`: of an uploaded sample's content; None if unknown.
         """
         return cls(
             time=now,

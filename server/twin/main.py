@@ -153,10 +153,10 @@ async def run(options: TwinSettings) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the twin's process until it is stopped.
+    """Run the twin's process until it is stopped; return the exit code.
 
-    It sets the level of the log and the interpreter's switch interval, `SWITCH_S`. `argv`:
-    arguments; None for those of the command line. Returns the exit code."""
+    `argv`: None: the command line's.
+    """
     options = parse(TwinSettings, argv)
     set_up(level=LEVELS[options.log_level], apart=True)
     sys.setswitchinterval(SWITCH_S)

@@ -61,17 +61,12 @@ class Reader:
 
 
 def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
-    """Decode a message or a batch and validate the parameters of its calls; runs in the worker.
+    """Decode a message or a batch and validate the parameters of its calls, in the
+    worker.
 
-    A malformed message raises nothing: its error is pickled.
-
-    Args:
-        codec: of the connection; None before one is agreed on.
-        most: largest number of items in a batch.
-        raw: bytes of the message.
-
-    Returns b"batch" or b"single", then for each item two entries: the method's name (b"" if
-    unknown or no call), and the pickle of `_pickled_call`.
+    A malformed message's error is pickled. `most`: items in a batch. Returns b"batch" or
+    b"single", then for each item the method's name (b"" if unknown or no call), and the
+    pickle of `_pickled_call`.
     """
     message = Connection(codec, max_batch=most).decode(raw)
     batch = isinstance(message, m.Batch)

@@ -65,8 +65,7 @@ def derived(
 def geometry_view(readout: Readout | None) -> w.GeometryState:
     """Convert the derived geometry to its wire form.
 
-    `readout`: None for a pose whose rotation axis or detector is not in front of the source.
-    Raises GeometryError: `readout` is None.
+    Raises GeometryError: None, axis or detector not before the source.
     """
     if readout is None:
         raise GeometryError(

@@ -268,11 +268,9 @@ def parse_formula(formula: str) -> dict[str, float]:
 
 
 def mass_fractions(atoms: Mapping[str, float]) -> dict[str, float]:
-    """Compute the mass fractions of a compound's elements from its numbers of atoms.
+    """Compute the mass fractions of a compound from its elements' numbers of atoms.
 
-    `atoms`: symbol -> number of atoms, above 0.
-    Returns symbol -> fraction, in the same order; they add up to 1.
-    Raises UnknownNameError: the tables lack an element.
+    They add up to 1. Raises UnknownNameError: the tables lack an element.
     """
     masses = {
         symbol: n * float(tables().molar_mass[_row(symbol)])

@@ -108,10 +108,10 @@ class CollisionScene:
     """
 
     def separation(self, pair: tuple[int, int]) -> Separate:
-        """Return the function that certifies how far the two bodies of a pair are apart; see
-        `separation_of`.
+        """Return the function that certifies a pair's distance; see `separation_of`.
 
-        It is made at the first call for a pair and kept. `pair`: indices of the bodies."""
+        `pair`: indices of bodies.
+        """
         if pair not in self._separations:
             a, b = (self.bodies[i].solid for i in pair)
             self._separations[pair] = separation_of(a, b)
@@ -227,12 +227,13 @@ class PairStack:
         return np.abs(self.slides)
 
     def clearances(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
-        """Compute lower bounds of the clearances while motors stay within a box of positions.
+        """Compute lower bounds of the clearances [mm] while motors stay within a box,
+        (..., m).
 
-        Motors that carry both bodies of a pair cancel; turning bodies count at every angle.
-        Bodies are bounded by their boxes; where these may overlap the bound is 0.
-        `lower`: (..., axes) least positions [mm, deg]; `upper`: (..., axes) greatest positions.
-        Returns (..., m) [mm], never too large."""
+        Motors that carry both bodies of a pair cancel; turning bodies count at every
+        angle. Bodies are bounded by boxes; where these may overlap it is 0. `lower`,
+        `upper`: (..., axes) positions.
+        """
         shape = (*lower.shape[:-1], len(self.pairs), 3)
         middle = (0.5 * (lower + upper) @ self.slides).reshape(shape) + self.offset
         spread = (0.5 * (upper - lower) @ self._reach).reshape(shape)

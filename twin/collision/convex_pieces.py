@@ -187,9 +187,10 @@ def _led_by(triangles: FloatArray, height: FloatArray, sign: float) -> FloatArra
 
 
 def _crossing(start: FloatArray, end: FloatArray, axis: int, at: float) -> FloatArray:
-    """Compute where edges `start` to `end` (n, 3) cross the plane of coordinate `axis` at `at`
-    [mm]. Returns (n, 3); that coordinate is `at` exactly. Edges parallel to the plane are not
-    allowed."""
+    """Compute where edges `start` to `end` (n, 3) cross a plane of `axis`.
+
+    None may be parallel to it.
+    """
     share = (at - start[:, axis]) / (end[:, axis] - start[:, axis])
     points = start + share[:, None] * (end - start)
     points[:, axis] = at

@@ -224,15 +224,7 @@ def clearance(scene: CollisionScene, positions: Mapping[str, float]) -> NearestP
 def touching(
     scene: CollisionScene, positions: Mapping[str, float]
 ) -> list[tuple[tuple[str, str], float]]:
-    """List every pair of a pose that is within the margin (and tolerance), by names, with
-    its clearance [mm]; 0 for an overlap.
-
-    Several bodies of one name give several entries; see `bodies_touching`.
-
-    Args:
-        scene: bodies and pairs.
-        positions: motor -> position [mm, deg]; motors left out are at home.
-    """
+    """List the pairs of a pose within the margin, by names, with clearances [mm]."""
     gaps = bodies_touching(scene, scene.vector(positions))
     return [(scene.names(pair), gap) for pair, gap in gaps]
 

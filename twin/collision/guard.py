@@ -62,10 +62,10 @@ class SceneGuard:
         return Contact(pair, now, here, here, now, near[pair], free_before=False)
 
     def standing(self, positions: Mapping[str, float]) -> SceneGuard:
-        """Return a guard with the stages on the turntable fixed where they are. Contacts are
-        then those of this pose, and not those of all that such a stage can sweep with its
-        sample. A scene without such stages, or of other bodies, gives this guard itself.
-        `positions`: motor -> position [mm, deg]."""
+        """Return a guard with the turntable's stages fixed where they are.
+
+        Contacts are then this pose's.
+        """
         parts = self.scene.parts
         if parts is None or not parts.mounts:
             return self

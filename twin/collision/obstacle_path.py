@@ -43,17 +43,13 @@ def free_moves(
 ) -> tuple[list[dict[str, float]] | None, Contact | None]:
     """Find moves from `start` to `targets` without a contact, each from rest to rest.
 
-    First all motors at once, then one by one, then with motors of the obstructing bodies aside.
-    Motors at their target already are not moved.
-
-    `scene`: bodies and pairs that must not touch. `machine`: travel limits, speeds,
-    accelerations. `start`: positions of all motors (those left out are at home) [mm, deg].
-    `targets`: motor -> position [mm, deg], within its travel. `paces`: motor -> (speed,
-    acceleration); default: the machine's.
-    Returns (moves, contact). Moves in order, each motor -> position, the motors of one move
-    together; one move if the direct path is free, none if nothing is to move; None if no free
-    path was found, or the target itself touches. The contact is that of all motors moving at
-    once, or None.
+    First all motors at once, then one by one, then with obstructing motors aside. Motors
+    at their target are not moved.
+    `start`, `targets`: motor -> [mm, deg], left out in the former at home; `paces`: motor
+    -> (speed, acceleration), default the machine's.
+    Returns moves in order, motors of one together; [] if nothing is to move, None if no
+    free path was found, or the target touches. The contact is that of all motors moving
+    at once, or None.
     """
     search = _Planner(scene, machine, dict(start), dict(paces or {}))
     goal = {axis: value for axis, value in targets.items() if value != search.at(axis)}
@@ -124,9 +120,10 @@ class _Planner:
         return contact
 
     def free(self, moved: Mapping[str, float], axis: str, value: float) -> bool:
-        """Return whether one motor's move touches nothing; the answer is remembered, so that a
-        repeated question costs no sweep. `moved`: motor -> position before the move, where it is
-        not that of the start; `axis`: the motor; `value`: its target [mm, deg]."""
+        """Return whether one motor's move touches nothing; answers are kept.
+
+        `moved`: positions not of the start [mm, deg].
+        """
         key = (tuple(sorted(moved.items())), axis, value)
         if key not in self.known:
             self.known[key] = self.contact(moved, {axis: value}) is None

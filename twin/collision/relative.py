@@ -389,14 +389,14 @@ class _Turn:
     def lever(
         self, normal: FloatArray, orientation: FloatArray, allowance: float
     ) -> tuple[float, float]:
-        """Compute a bound of how fast the solid approaches by turning, and within what turn it
-        holds: (mm per rad, rad).
+        """Bound how fast the solid approaches by turning, and within what turn: (mm per
+        rad, rad).
 
-        The crude bound, the reach across the axis, holds for any turn (inf) and is taken where
-        it is good enough. Else it is a chord, since the nearing along a fixed normal is a convex
-        function of the turn.
-        `normal`: (3,) unit direction from b to a; `orientation`: of the body, (3, 3);
-        `allowance`: approach for which the bound is made [mm], > 0."""
+        The reach across the axis holds for any turn (inf). A chord may be better, as the
+        nearing along a fixed normal is a convex function of the turn.
+        `normal`: (3,) from b to a; `allowance`: approach for which the bound is made
+        [mm], > 0.
+        """
         along = float(normal @ self.body.spin_axis)
         crude = self.body.reach * math.sqrt(max(0.0, 1.0 - along * along))
         turn = self.body.turn_until(
@@ -692,16 +692,9 @@ def refine_pair(
 ) -> tuple[float, int]:
     """Refine the least clearance of a pair that is known to be free.
 
-    It ends once the best clearance is within the slack of 0, an overlap for instance.
-
-    Args:
-        motion: of one body relative to the other.
-        separate: their certified clearance in a pose.
-        limits: margin, accuracy.
-        best: clearance of interest [mm]; greater ones are not refined.
-
-    Returns a clearance that occurs, not more than `limits.slack` above the least (`best` if
-    nothing is below that), and the number of evaluations.
+    It ends once the best is within the slack of 0. `best`: clearance of interest [mm];
+    greater ones are not refined. Returns a clearance that occurs, not more than
+    `limits.slack` above the least (`best` if nothing is below), and the number of looks.
     """
     at: Moment | None = START
     looks = 0

@@ -107,11 +107,8 @@ def _deeper(
 ) -> tuple[Moment, Moment] | None:
     """Find when the separation of an overlapping pair falls to its floor.
 
-    The floor follows from the separation at the start and the margin (`safety.floor`).
-
-    `motion`: of one body relative to the other; `overlap`: directions across which the bodies
-    are judged; `margin`: clearance to keep [mm].
-    Returns the moment of the look before, and that of the fall; None for never.
+    The floor (`safety.floor`) follows from the start and the margin [mm]. Returns the
+    moment of the look before, and that of the fall; None for never.
     """
     look = motion.look(START, overlap.separate)
     level = floor(look.gap, margin)
@@ -202,13 +199,7 @@ class _Overlap:
     def _reach_of(
         self, i: int, directions: FloatArray, turned: tuple[FloatArray, FloatArray]
     ) -> FloatArray:
-        """Compute how far body `i` (0 or 1) extends from its origin towards the other
-        across directions, (k,) [mm].
-
-        Args:
-            directions: (k, 3) unit directions from the second to the first, in the world.
-            turned: orientations of both.
-        """
+        """Compute how far body `i` extends towards the other, (k,) [mm]."""
         towards = directions if i else -directions
         return self.bodies[i].solid.support(towards @ turned[i])
 

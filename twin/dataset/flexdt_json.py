@@ -297,10 +297,9 @@ class ScanRecord(ArrayValue):
         return motor_poses(self.machine, self.profile, block.camera, block.positions)
 
     def cone_vec(self, blocks: Iterable[FrameBlock] | None = None) -> ConeVec:
-        """Compute the nominal geometry of all images, or of `blocks`, in order, without a
-        correction and a detector shape.
+        """Compute the nominal geometry of all images, or of `blocks`, in order.
 
-        Empty blocks are skipped; GeometryError if all are.
+        Without a detector shape. GeometryError if all are empty.
         """
         if blocks is None:
             chosen = self.blocks
@@ -619,10 +618,10 @@ class DatasetDocument(_Model):
         return ConeVec(np.array(rows, dtype=np.float64).reshape(-1, 12))
 
     def positions(self, kind: FrameKind = "projection") -> dict[str, FloatArray]:
-        """Collect the motor positions of the frames of one kind: motor -> (n,) [mm, deg].
+        """Collect the motor positions of frames of one kind: motor -> (n,) [mm, deg].
 
-        The motors are those of the first such frame; {} if there is none. KeyError if a
-        later frame lacks one."""
+        Motors are the first frame's; {} without frames.
+        """
         chosen = [f.positions for f in self.frames if f.kind == kind]
         return {
             n: np.array([p[n] for p in chosen]) for n in (chosen[0] if chosen else {})

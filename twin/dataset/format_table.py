@@ -105,9 +105,7 @@ def noted_all(
     divider: str | None = None,
     under: str = "",
 ) -> tuple[Field, ...]:
-    """Make fields of one meaning that bear on nothing; names are divided by blanks, or by
-    a divider, and follow `under`.
-    """
+    """Make fields of one meaning that bear on nothing, from names with a divider."""
     return tuple(
         noted(f"{under}{name}", meaning, because) for name in names.split(divider)
     )
@@ -240,11 +238,11 @@ class Ledger:
     def state(
         self, name: str, value: object, place: str = "", *, listed: bool = False
     ) -> None:
-        """Enter a value of the file, in its order; every one is entered once.
+        """Enter a value of the file, in its order, once.
 
-        `name`: of its field, as the table has it; `value`: as text; `place`: where it stands in
-        the file, if that is not the field's name; `listed`: whether it belongs to a member of a
-        list, whose others state other things."""
+        `place`: where it stands, if that is not the field's `name`; `listed`: a list's
+        member.
+        """
         entry = _Entry(place or name, name, str(value))
         self._entries.append(entry)
         if listed:

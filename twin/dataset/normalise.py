@@ -65,22 +65,21 @@ class LineIntegrals:
         return cls(np.asarray(dark, dtype=np.float32), log_open, dead, *_neighbours(dead))
 
     def interpolating(self, mask: npt.NDArray[np.bool_]) -> LineIntegrals:
-        """Return a conversion that interpolates more pixels.
+        """Return a conversion that interpolates the pixels of a mask as well.
 
-        Pixels that are dead already stay so. If no pixel would be left, the conversion itself is
-        returned. `mask`: (rows, cols), True for pixels to interpolate."""
+        It is this one if no pixel would be left.
+        """
         dead = self.dead | mask
         if dead.all():
             return self
         return LineIntegrals(self.dark, self.log_open, dead, *_neighbours(dead))
 
     def __call__(self, counts: npt.NDArray[np.generic]) -> Float32Array:
-        """Convert an image of counts to line integrals; dead pixels are interpolated in their
-        row.
+        """Convert counts (rows, cols) to finite line integrals, float32.
 
-        Counts less the dark are taken as at least `MIN_COUNTS`; `counts` is not changed. A dead
-        pixel without a live one on both sides gets the nearest live pixel's value. `counts`:
-        (rows, cols). Returns float32 (rows, cols), finite."""
+        Counts less the dark are taken as at least `MIN_COUNTS`. Dead pixels are
+        interpolated in their row, or get the nearest live pixel's value.
+        """
         out: Float32Array = np.subtract(counts, self.dark, dtype=np.float32)
         np.maximum(out, np.float32(MIN_COUNTS), out=out)
         np.log(out, out=out)
@@ -92,20 +91,12 @@ class LineIntegrals:
 def of_intensities(
     images: npt.NDArray[Any], dark: npt.NDArray[Any] | float, flat: npt.NDArray[Any]
 ) -> Float32Array:
-    """Convert images that are not whole counts to line integrals.
+    """Convert images that are not whole counts to line integrals (n, rows, cols).
 
-    Such images are dark-subtracted, averaged or scaled, or transmissions with a flat
-    image of ones. Light counts as at least float32's smallest normal number. Pixels whose
-    open beam is not above `LEAST_LIGHT` of the brightest flat pixel are dead, NaN too, and
-    interpolated in their row.
-
-    Args:
-        images: (n, rows, cols), of any scale; noise may bring them below the dark image.
-        dark: mean dark image (rows, cols), or one value, on the same scale.
-        flat: mean flat image (rows, cols), on the same scale.
-
-    Returns:
-        float32 (n, rows, cols).
+    Such are averaged or scaled, or transmissions with a flat image of ones; noise may
+    bring them below the dark image. Light counts as at least float32's smallest normal
+    number. Pixels whose open beam is not above `LEAST_LIGHT` of the brightest, NaN too,
+    are interpolated in their row.
 
     Raises:
         DatasetFormatError: no pixel of the flat is brighter than the dark image.

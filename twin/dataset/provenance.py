@@ -118,9 +118,7 @@ class Provenance(tuple[Stated, ...]):
     def replaced(self, parts: Collection[Part], by: str) -> Provenance:
         """Mark the values of some parts as contradicted by what the caller gave.
 
-        Args:
-            parts: of the scan.
-            by: what takes their place, such as "angles=".
+        `by`: such as "angles=".
         """
         return Provenance(
             replace(one, use=Use.CONTRADICTED, consequence=f"{by} takes its place")

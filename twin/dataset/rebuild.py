@@ -49,16 +49,12 @@ class Rebuilt:
 
 
 def angles_deg(settings: ScanSettings, count: int, file: str) -> FloatArray:
-    """Compute stage angles of images 0 to count - 1 by the smooth-scan rule: i * (last - start)
-    / (N - 1).
+    """Compute stage angles of images 0 to count - 1, i * (last - start) / (N - 1),
+    (count,) [deg].
 
-    N is `count` where the texts state none; the step is 0 for N up to 1. Images beyond N
-    continue the rule.
-
-    `settings`: gives N ("# projections"), start and last angle; rot_obj there is the run-up
-    position and does not enter. `count`: number of images wanted. `file`: for error messages.
-    Returns angles (count,) [deg].
-    Raises DatasetFormatError: the texts state no angles.
+    N is "# projections", or else `count`; images beyond it continue. The texts' rot_obj
+    is the run-up position and does not enter. Raises DatasetFormatError: no angles are
+    stated.
     """
     start = settings.start_angle_deg
     last = settings.last_angle_deg
@@ -203,16 +199,14 @@ def _profile(
     positions: Mapping[str, FloatArray],
     printed: Figures | None,
 ) -> tuple[Profile, str] | None:
-    """Choose the only profile given, or the first of this machine that reproduces the printed
+    """Choose the only profile given, or the machine's first that reproduces the printed
     figures.
 
-    Compared at the first image's positions (`_figures_agree`). Zero offsets are tried last, only
-    for a machine without a default profile.
-
-    `machine`: whose profiles count. `profiles`: candidates of any machine; one alone is taken as
-    it is. `camera`: of the images. `positions`: motor -> (n,) positions [mm, deg]. `printed`:
-    figures of the texts; None: the machine's default profile is taken, unchecked.
-    Returns the profile and the reason for the choice; None if no profile fits.
+    Compared at the first image's positions (`_figures_agree`). Zero offsets are tried
+    last, only for a machine without a default; without figures it is the default,
+    unchecked.
+    `profiles`: of any machine. `positions`: motor -> (n,) [mm, deg]. Returns also the
+    reason for the choice; None if no profile fits.
     """
     if len(profiles) == 1:
         return profiles[0], ": as asked"
@@ -232,20 +226,12 @@ def _profile(
 
 
 def named_machine(settings: ScanSettings, machines: Sequence[Machine]) -> Machine | None:
-    """Find the machine that the texts name or, without a name, the only one whose motors
-    they all list.
+    """Find the machine that the texts name, or else the only one whose motors they all
+    list.
 
-    Letter case, blanks and signs do not matter. The stated scanner name or type must be a
-    machine's scanner name, type or name, or begin with it; the first such machine is
-    taken.
-
-    Args:
-        settings: read from the texts.
-        machines: candidates, in order.
-
-    Returns:
-        The machine; None if a stated name fits none, or, without a name, none or several
-        fit.
+    Letter case, blanks and signs do not matter. A scanner name or type must be a
+    machine's scanner name, type or name, or begin with it; the first such one is taken.
+    None if a stated name fits none, or without a name none or several fit.
     """
     stated = {_word(settings.scanner_name), _word(settings.scanner_type)} - {""}
     for machine in machines:
@@ -272,19 +258,10 @@ def _word(text: str | None) -> str:
 def _positions(
     settings: ScanSettings, machine: Machine, angles: FloatArray
 ) -> tuple[dict[str, FloatArray], list[str]]:
-    """Compute motor positions in the script's sign from the texts, with the rotation by
-    the angle rule.
+    """Compute motor positions [mm, deg] in the script's sign from the texts.
 
-    A motor that turns the stage gets the angle over its factor. Other motors that the
-    texts lack are at home, with a note each.
-
-    Args:
-        settings: with the motors' lines, in the sign of the settings file.
-        machine: whose motors these are.
-        angles: stage angles (n,) [deg].
-
-    Returns:
-        Motor -> (n,) positions [mm, deg], and notes for the user.
+    A motor that turns the stage gets the `angles` (n,) [deg] over its factor; others that
+    the texts lack are at home, with a note each. Returns motor -> (n,), and the notes.
     """
     notes = []
     out = {}
@@ -340,11 +317,10 @@ def _camera(
 
 
 def _figures_agree(ours: Figures, printed: Figures) -> bool:
-    """Return whether figures agree with the printed ones, within `MATCH_MM`, `MATCH_PX`
-    and 1e-5 mm of pitch.
+    """Return whether figures agree with the printed ones.
 
-    SOD and SDD are compared in mm, HC, VC and COR in pixels; every figure must differ by
-    less."""
+    Within `MATCH_MM` (SOD, SDD), `MATCH_PX` (HC, VC, COR), 1e-5 mm of pitch.
+    """
     slack = {"sod_mm": MATCH_MM, "sdd_mm": MATCH_MM, "pixel_mm": 1e-5}
     return all(
         abs(value - getattr(printed, name)) < slack.get(name, MATCH_PX)
@@ -353,10 +329,9 @@ def _figures_agree(ours: Figures, printed: Figures) -> bool:
 
 
 def _default_profile(machine: Machine, profiles: Sequence[Profile]) -> Profile | None:
-    """Find the default profile of a machine among `profiles`; zero offsets where it has
-    none, None where it is missing.
+    """Find the default profile of a machine among `profiles`.
 
-    Names of machine and profile must both agree; the first such one is taken.
+    Zero offsets where it has none, None where it is missing.
     """
     if not machine.default_profile:
         return profile_of(machine)

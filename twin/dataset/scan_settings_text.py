@@ -71,10 +71,8 @@ def clean(text: str) -> str:
 def parse_number(text: str) -> float:
     """Read a finite number as scanners write: `1.5`, `1,5`, `1.5;`, `1.5 mm`, `874.6E-9`.
 
-    One comma without a point is the decimal sign; all after a space is dropped. Infinity,
-    NaN and underscores are errors.
-
-    Raises ValueError: no number.
+    One comma without a point is the decimal sign; all after a space is dropped. Raises
+    ValueError.
     """
     word = text.strip().rstrip(";").strip().split(" ")[0]
     if word.count(",") == 1 and "." not in word:

@@ -89,15 +89,12 @@ def poses_of(
     source_z: float = 0.0,
     axis_z: float = 0.0,
 ) -> Poses:
-    """Compute poses with these figures and an upright detector; the inverse of `figures_of`.
+    """Compute poses with these figures and an upright detector; the inverse of
+    `figures_of`.
 
-    Pixels are square; the source is at y = 0. The figures do not determine the scanner's origin
-    and the sample's height, so those are arguments.
-
-    `figures`: as printed; `shape`: image (rows, cols); `angles`: stage angle of each frame, (n,)
-    [rad]; `source_x` and `source_z`: focal spot [mm], world; `axis_z`: height of the sample's
-    reference point [mm], world.
-    Returns n poses.
+    The source is at y = 0. Figures do not determine the scanner's origin and the sample's
+    height: `source_x`, `source_z` and `axis_z` [mm] are world coordinates. `angles`: of
+    the stage, (n,) [rad].
     """
     f, (rows, cols) = figures, shape
     axis_x = source_x + (f.cor_px - f.hc_px) * f.pixel_mm * f.sod_mm / f.sdd_mm

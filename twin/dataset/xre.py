@@ -121,9 +121,7 @@ def format_settings(settings: ScanSettings) -> str:
 
 
 def format_sections(sections: Sections) -> str:
-    """Format sections as text with CRLF: `[name]`, one line for each entry, and an empty line
-    between sections. Texts are quoted, truth values TRUE and FALSE, whole numbers without
-    decimals, others with six."""
+    """Format sections as text with CRLF: `[name]`, a line an entry, an empty line."""
     blocks = [
         f"[{clean(name)}]{EOL}{_lines(entries)}" for name, entries in sections.items()
     ]
@@ -206,11 +204,10 @@ def _entry(
     track: bool = False,
     safe: bool = True,
 ) -> str:
-    """Format one place with its three axes, a radius and a height, as one text of the XRE file.
+    """Format one place with its axes, radius and height, as a text of the XRE file.
 
-    The movable range is always infinite.
-    `place`: (3,) [mm], world frame. `x` and `y` and `z`: axes, (3,) each. `radius` and `height`:
-    of the thing there [mm]; -1: no height. `track` and `safe`: switches of the entry."""
+    Vectors are (3,) [mm], world frame; the range is infinite; height -1: none.
+    """
     return (
         f"WC{_triple(place)}dirX{_triple(x)}dirY{_triple(y)}dirZ{_triple(z)}radius[{radius:f}]"
         f"height[{height:f}]track[{str(track).upper()}]safe range?[{str(safe).upper()}]"

@@ -33,12 +33,9 @@ class XreSettings:
         )
 
     def number(self, section: str, key: str) -> float | None:
-        """Return an entry's value as a number (`parse_number`); None if it is absent or
-        empty.
+        """Return an entry's value as a number; None if absent or empty.
 
-        Case of section and key does not matter.
-
-        Raises DatasetFormatError: it is no number.
+        Case does not matter. Raises DatasetFormatError: no number.
         """
         text = self.text(section, key)
         if text is None:

@@ -48,16 +48,11 @@ ORIGINS: Final = {
 
 
 def cil_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
-    """Convert a geometry to CIL's arguments.
+    """Convert a geometry to CIL's arguments, name (of `POSES`, `PANEL`) -> array.
 
-    Rows point up, so their direction is -v; num_pixels and pixel_size are (columns, rows).
-
-    Args:
-        geometry: with the detector's shape.
-
-    Returns name (of `POSES` and `PANEL`) -> array: places and unit directions (n, 3) [mm],
-    numbers and sizes of pixels, origin of the panel.
-    Raises ExchangeError: skew pixels, several pixel sizes, or an unknown shape.
+    Rows point up: their direction is -v; num_pixels and pixel_size are (columns, rows).
+    Places and unit directions are (n, 3) [mm]. Raises ExchangeError: skew pixels, several
+    pixel sizes, or an unknown shape.
     """
     rows, columns = require_shape(geometry, "CIL")
     pitch_u, pitch_v = require_panel(geometry.cone_vec, "CIL")

@@ -204,11 +204,9 @@ def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
 
 
 def require_each(what: str, off: FloatArray, most: float) -> None:
-    """Check that a figure of every view, (n,), n > 0, is at most `most`.
+    """Check that a figure of every view, (n,), is at most `most`.
 
-    `what`: name of the figure, for the message; `off`: (n,) the figure; `most`: greatest value
-    allowed.
-    Raises ExchangeError: one is above; names the view with the largest.
+    Raises ExchangeError with its name `what`, and the view with the largest.
     """
     view = int(np.argmax(off))
     if off[view] > most:

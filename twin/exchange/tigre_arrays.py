@@ -107,11 +107,9 @@ def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 
 
 def _once(values: FloatArray) -> FloatArray:
-    """Return one value, (1,) or (k,), if all views agree to `CONSTANT_TOLERANCE`, else the
-    values of all views.
+    """Return one value, (1,) or (k,), if all views agree to `CONSTANT_TOLERANCE`.
 
-    The first view's value stands for all; negative zeros become 0.
-    `values`: (n,) or (n, k).
+    Else (n,) or (n, k) values of all views. Negative zeros become 0.
     """
     still = np.ptp(values, axis=0).max() <= CONSTANT_TOLERANCE
     if values.ndim == 1:
@@ -202,11 +200,11 @@ def _compare_sizes(said: Ledger, arrays: Arrays, sizes: tuple[float, float]) -> 
 
 
 def _each(arrays: Arrays, name: str, size: int, file: str, views: int) -> FloatArray:
-    """Return the value of each view from an array with one value or one for each view.
+    """Return each view's value from an array with one, or one for each view.
 
-    `arrays`: name -> array. `name`: of the attribute. `size`: length of a value; 0 for a single
-    number. `file`: for messages. `views`: number of views. Returns (views,) for a size of 0,
-    else (views, size). Raises ExchangeError: another shape, or a number that is not finite."""
+    (views, size); (views,) for a size of 0, a single number. Raises ExchangeError:
+    another shape, or not finite.
+    """
     form: tuple[int, ...] = (size,) if size else ()
     single: tuple[int, ...] = (size,) if size else (1,)
     if np.shape(arrays[name]) == single:

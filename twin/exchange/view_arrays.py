@@ -72,13 +72,9 @@ def views_of(arrays: Arrays, name: str, file: str) -> int:
 
 
 def vectors_of(arrays: Arrays, names: Sequence[str], file: str) -> list[FloatArray]:
-    """Read arrays (n, 3) of finite numbers, all with the n of the first.
+    """Read arrays (n, 3) of finite numbers, n that of the first.
 
-    Returns:
-        Arrays in the order of `names`, float64 (n, 3).
-
-    Raises:
-        ExchangeError: an array has no view, another shape or other content.
+    Raises ExchangeError.
     """
     count = views_of(arrays, names[0], file)
     return [numbers_of(arrays, name, file, (count, SPACE)) for name in names]

@@ -155,19 +155,16 @@ class Follower:
                 assert_never(heard.what)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
-        """Update the mirror after time without a message: raise alarms for overdue and silent
-        commands and a late script.
+        """Update the mirror after time without a message: alarms for overdue or silent
+        commands.
 
-        Only commands with a prediction that are not superseded can be overdue or silent. An
-        overdue one (`most_s` and `SLACK_S`) is a warning, after which ends count as not
-        reported, unless one has been heard; a server that does not report ends has its commands
-        ended by prediction instead, and its arrivals judged. Silence of `MAX_SILENCE_S`, before
-        it is overdue, is a warning, after which the server counts as one that does not speak,
-        unless it has; of such a server silence is expected. Commands silent for
-        `FORGOTTEN_AFTER_S` (or `most_s`, if longer) are forgotten. The script is late `SLACK_S`
-        after it was due. An alarm is raised once until its condition ends.
-
-        `mirror`: present state; `now`: moment [s].
+        Only predicted ones, not superseded, count. An overdue one (`most_s` and
+        `SLACK_S`) is a warning, after which ends count as not reported unless one was;
+        then commands end by prediction, and arrivals are judged. Silence of
+        `MAX_SILENCE_S` before is a warning, too, after which the server counts as silent,
+        unless it has spoken. Commands silent for `FORGOTTEN_AFTER_S` or `most_s` are
+        forgotten. The script is late `SLACK_S` after it was due. An alarm is raised once
+        while it lasts.
         """
         if mirror.ends is False:
             mirror = self._end_overdue(mirror, "", now)
@@ -226,10 +223,10 @@ class Follower:
     ) -> Mirror:
         """Update the mirror after the link has come up or gone down.
 
-        Coming up ends the alarms of the link and forgets nothing. Going down forgets the
-        commands under way, takes motors as at rest where they were heard last, drops the
-        script's due time, and raises an error alarm with the reason.
-        `connected`: whether the link is up; `now`: moment [s]; `why`: reason for the loss."""
+        Coming up ends its alarms. Going down forgets commands under way and the due time,
+        takes motors as at rest where last heard, and raises an error with the reason
+        `why`.
+        """
         if connected:
             return replace(mirror.cleared("link"), connected=True)
         axes = {n: a.at_rest for n, a in mirror.axes.items()}
@@ -351,16 +348,11 @@ class Follower:
         return replace(mirror, waiting={**newest, heard.identity: waiting})
 
     def _end_overdue(self, mirror: Mirror, component: str, now: float) -> Mirror:
-        """Mark commands whose predicted time is over as ended, and apply their settings.
+        """Mark commands of a component ("": all) whose predicted time is over as ended.
 
-        A command without a prediction is over at once. Each ends once: it is marked as
-        superseded, stays in `waiting`, and gets no line or alarm here. Lateness of its
-        message is added to the time that has passed.
-
-        Args:
-            mirror: present state.
-            component: whose commands end; "" for all.
-            now: moment [s].
+        Their settings are applied, without alarms. One without a prediction is over at
+        once; each ends once, as superseded, and stays in `waiting`. A message's lateness
+        counts as passed.
         """
         for waiting in mirror.waiting.values():
             over = now + waiting.heard.late_s - waiting.sent_s > (
@@ -607,11 +599,11 @@ class Follower:
     def _arrival(
         self, mirror: Mirror, name: str, there: float, meant: float, now: float
     ) -> Mirror:
-        """Return the mirror, with an error alarm `offset` if a motor is more than
-        `TARGET_TOLERANCE` from where its move led.
+        """Raise an alarm `offset` if a motor is more than `TARGET_TOLERANCE` from its
+        target.
 
-        `mirror`: present state; `name`: of the motor; `there`: its position [mm, deg]; `meant`:
-        target of the move; `now`: moment [s]."""
+        `there`: its position, `meant`: its target [mm, deg].
+        """
         if abs(there - meant) <= TARGET_TOLERANCE:
             return mirror
         unit = self.machine.axes[name].unit
@@ -698,10 +690,10 @@ class Follower:
         return _compare_at_rest(mirror, reading, explained)
 
     def _motor(self, axis: str, at: float) -> tuple[str, float]:
-        """Return the motor that a reading of `axis` is of, and that motor's position.
+        """Return the motor that a reading of `axis` is of, and its position.
 
-        The reading of a virtual axis is converted to the motor that it reads; any other
-        axis is returned as it is."""
+        Virtual axes are converted.
+        """
         virtual = self.machine.virtual_axes.get(axis)
         if virtual is None:
             return axis, at
@@ -857,9 +849,10 @@ def _alarm(
 
 
 def _bounds(step: PlanStep, machine: Machine) -> Range:
-    """Compute bounds of a step's time that a healthy machine exceeds less than once a day [s]:
-    (least, most). A measured time has its 90 % range, widened; an assumed one may be anything
-    from nothing to twice itself."""
+    """Bound a step's time [s], which a healthy machine exceeds less than once a day.
+
+    An assumed time may be 0 to twice itself.
+    """
     measured = step_range(step, machine.timing)
     if measured is None:
         return (step.computed_s, step.holds_s + step.assumed_s)
@@ -947,9 +940,7 @@ def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, 
 
 
 def _number(text: str) -> float | None:
-    """Parse a text as a finite number (`grammar.number`), blanks around it dropped; None
-    if it is none.
-    """
+    """Parse a text as a finite number, or None."""
     try:
         return number(text.strip(), "position")
     except ArgumentError:

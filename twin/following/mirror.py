@@ -288,11 +288,7 @@ class Mirror:
     ) -> Mirror:
         """Return the mirror with a motor that a command has sent on a path.
 
-        Args:
-            name: of the motor.
-            path: predicted motion, in the listener's time.
-            mover: the command.
-            delay_s: the most that a move takes beyond its motion [s].
+        `delay_s`: the most that a move takes beyond its motion.
         """
         axis = replace(
             self.axes[name].at_rest,

@@ -104,19 +104,14 @@ NOMINAL: Final = Offsets()
 
 
 def require_plausible(parameters: Offsets, reach_mm: float) -> None:
-    """Check that offsets are within the range of a real scanner, to find slips of a unit,
-    a sign or a digit (limits assumed).
+    """Check that offsets are within a real scanner's range, to find slips (limits
+    assumed).
 
-    Shifts are within `reach_mm`, tilts within `MAX_TILT_DEG`, angle_scale within
-    `ANGLE_SCALE_RANGE`, ends included; `alpha` may be any angle. The first outside is
-    named; NaN is outside.
-
-    Args:
-        parameters: the offsets to check.
-        reach_mm: the longest travel, the largest plausible shift.
+    Shifts are within `reach_mm`, tilts `MAX_TILT_DEG`, angle_scale `ANGLE_SCALE_RANGE`;
+    `alpha` is free. NaN is outside.
 
     Raises:
-        GeometryError: an offset is out of its range; the message names it.
+        GeometryError: names the first offset out of its range.
     """
     ranges = {
         "mm": (-reach_mm, reach_mm),

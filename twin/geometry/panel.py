@@ -77,10 +77,10 @@ class PanelModel:
 
     @property
     def sigmas(self) -> FloatArray:
-        """Standard deviations of the coefficients' priors, (m,) [px], in the order of
-        `names`; the priors' means are zero.
+        """Standard deviations of the coefficients' zero-mean priors, (m,) [px].
 
-        `width_px` for affine and bending terms, `GAP_SIGMA_PX` for gaps between tiles."""
+        `GAP_SIGMA_PX` for gaps.
+        """
         m = len(self.names)
         out = np.full(m, self.width_px)
         out[m - 2 * len(self.borders) :] = GAP_SIGMA_PX
@@ -171,18 +171,10 @@ class Panel:
         return out[..., 0].astype(np.float32), out[..., 1].astype(np.float32)
 
     def without_lag(self, image: Float32Array, before: Float32Array) -> Float32Array:
-        """Subtract from an image's line integrals the light of the frame `before` that it
-        still shows.
+        """Subtract from line integrals (rows, cols) the light still shown of the frame
+        `before`.
 
-        The earlier frame counts as it was measured, with its own lag: of a lag of 5 %
-        some 0.2 % remain. At least `MIN_LIGHT_SHARE` of each pixel's light stays.
-
-        Args:
-            image: line integrals, (rows, cols).
-            before: line integrals of the frame before, as measured.
-
-        Returns:
-            New line integrals, float32 (rows, cols).
+        That is as measured, with its own lag: of 5 % some 0.2 % remain.
         """
         share = self.lag / (1.0 - self.lag)
         shown = np.exp(-image)
@@ -192,16 +184,11 @@ class Panel:
         )
 
     def undistorted(self, image: Float32Array) -> Float32Array:
-        """Resample an image as a panel without distortion would have taken it.
+        """Resample an image (rows, cols) as a panel without distortion would have taken
+        it.
 
-        By Lanczos interpolation; places beyond the image get the value at its edge. The lag is
-        not removed.
-
-        Args:
-            image: (rows, cols).
-
-        Returns float32 (rows, cols); the image itself where there is no distortion.
-        Raises TwinError: an image of another shape than those in which the distortion was found.
+        By Lanczos, its edge repeated; the lag stays. Without distortion it is the image
+        itself. Raises TwinError: a shape other than that of the distortion.
         """
         if not any(self.coefficients):
             return image

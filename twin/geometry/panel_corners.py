@@ -9,12 +9,11 @@ from flexdt.twin.geometry.conventions import FloatArray
 
 
 def panel_corners(cone_vec: ConeVec) -> FloatArray:
-    """Compute the outer corners of the panel, at the outer edges of its corner pixels, (n, 4, 3)
-    [mm].
+    """Compute the outer corners of the panel, (n, 4, 3) [mm].
 
-    `cone_vec`: n views that know the detector's shape; GeometryError otherwise. Returns in each
-    view the corners at row 0 column 0, then at the last column, last row and last column, last
-    row: top left, top right, bottom right, bottom left, as the source sees them."""
+    As the source sees them: top left (row 0, column 0), top right, bottom right, bottom
+    left. GeometryError without the detector's shape.
+    """
     _, rows, cols = cone_vec.shape
     across, down = cone_vec.u * cols / 2, cone_vec.v * rows / 2
     offsets = np.stack(

@@ -135,16 +135,13 @@ class Poses:
     def from_cone_vec(cls, cone_vec: ConeVec) -> Poses:
         """Make world poses whose nominal cone_vec is this one, to 1e-12 of its size.
 
-        The stage angle of a view is the direction of u seen from above, unwrapped in
-        frame order (no step is larger than half a turn), so an object at rest in the
-        world stays at rest here and correction parameters keep their meaning. A panel
-        turned by det_yaw is taken for a turn of the sample, which only shifts alpha. The
-        axis is the object frame's z and passes through the world's origin. The detector's
-        shape is lost.
+        The stage angle is the direction of u seen from above, unwrapped, so that an
+        object at rest in the world stays at rest. A det_yaw is taken for a turn of the
+        sample, which only shifts alpha. The axis is the object frame's z through the
+        world's origin. The detector's shape is lost.
 
         Raises:
-            GeometryError: u is vertical in some view (horizontal part below 1e-6 of it);
-                names the first.
+            GeometryError: u is vertical in some view; names the first.
         """
         u = cone_vec.u
         standing = np.hypot(u[:, 0], u[:, 1]) < 1e-6 * np.linalg.norm(u, axis=1)
@@ -173,20 +170,13 @@ class Poses:
         return np.asarray(self.sdd / self.sod / np.linalg.norm(self.u, axis=1))
 
     def cone_vec(self, parameters: Offsets = NOMINAL) -> ConeVec:
-        """Compute the geometry in the object's frame, with `parameters` added to nominal.
+        """Compute the geometry in the object's frame, with `parameters` [mm, rad] added.
 
         A point b of the phantom is in the world at q = c + T R(alpha + angle_scale *
         angle) (b + mount - tau), c = O + dO + tau, with R clockwise from above and T the
         axis tilt (axis_tilt_x about world +x, then axis_tilt_z about world +y, pivot c,
-        assumed): thesis eq. 5.4 for T = 1. The rows are the world geometry under the
-        inverse of that map. The detector is shifted by dD, then turned by det_yaw about
-        v, det_pitch about the turned u, det_roll about the turned normal.
-
-        Args:
-            parameters: offsets [mm, rad].
-
-        Returns:
-            n views, one for each pose.
+        assumed): thesis eq. 5.4 for T = 1. The detector is shifted by dD, then turned by
+        det_yaw about v, det_pitch about the turned u, det_roll about the turned normal.
         """
         p = parameters
         tau = from_unity([p.tau_x, 0.0, p.tau_z])

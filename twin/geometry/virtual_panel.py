@@ -57,11 +57,9 @@ def run_through(cone_vec: ConeVec, points: FloatArray) -> ConeVec:
 
 
 def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
-    """Move panels to `times` their distance from the source, with pixels enlarged alike, so that
-    the images stay the same.
+    """Move panels to `times` (n,) their distance, with pixels enlarged: the same images.
 
-    `cone_vec`: n views. `times`: (n,), factors; 1 leaves a view as it is.
-    Returns a new geometry; the argument itself if all are 1.
+    Returns the argument itself if all are 1.
     """
     moved = times != 1.0
     if not moved.any():
@@ -72,11 +70,10 @@ def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
 
 
 def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
-    """Stretch rows (n, 12), or changes of such rows, to panels `times` (n,) as far from the
-    source, with pixels enlarged alike.
+    """Stretch rows (n, 12), or changes of such, to panels `times` (n,) as far.
 
-    The source's three numbers stay; the input is not changed.
-    Returns new rows, (n, 12)."""
+    The source's numbers stay.
+    """
     out = rows.copy()
     many = times[:, None]
     out[:, 3:6] = rows[:, :3] + many * (rows[:, 3:6] - rows[:, :3])
@@ -85,18 +82,10 @@ def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
 
 
 def relaxed_gradient(gradient: FloatArray, times: FloatArray) -> FloatArray:
-    """Convert derivatives by the rows of `stretched_steps` to derivatives by the original
-    rows (chain rule).
+    """Convert derivatives (n, 12) by the rows of `stretched_steps` to those by the
+    original.
 
-    Those by detector and pixels are multiplied by the stretch; those by the source get (1
-    - stretch) of the detector's.
-
-    Args:
-        gradient: (n, 12), by the stretched rows; not changed.
-        times: (n,), the factors of the stretch.
-
-    Returns:
-        (n, 12), by the rows before they were stretched.
+    `times`: (n,), the stretch.
     """
     out = gradient.copy()
     many = times[:, None]

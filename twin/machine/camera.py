@@ -54,9 +54,7 @@ class PixelGrid:
 
     @property
     def edges_mm(self) -> tuple[float, float]:
-        """Unbinned pitch from column to column and from row to row [mm]; equal without a
-        `row_pitch_mm`.
-        """
+        """Unbinned pitch [mm] from column to column and from row to row."""
         return (
             self.pitch_mm,
             self.pitch_mm if self.row_pitch_mm is None else self.row_pitch_mm,
@@ -127,18 +125,11 @@ class CameraSettings:
         return across * self.binning, up * self.binning
 
     def roi_shift_mm(self, grid: PixelGrid) -> tuple[float, float]:
-        """Compute the shift of the image's center from the sensor's center [mm].
+        """Compute the shift [mm] of the image's center from the sensor's, (columns,
+        rows).
 
         For the thesis's ROI 32 8 1943 1527 that is (+1.1968, 0), as flexDATA has it.
-
-        The center is that of the whole binned pixels: a rest of the ROI that fills none
-        is cut off at the right and below.
-
-        Args:
-            grid: pixels of the sensor.
-
-        Returns:
-            (along growing columns, along growing rows).
+        Whole binned pixels count.
         """
         rows, cols = self.shape
         b = self.binning

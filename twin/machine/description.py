@@ -889,13 +889,10 @@ class Machine(_Frozen):
         return axis in self.axes or axis in self.virtual_axes
 
     def moves(self, axis: str) -> Mapping[str, float]:
-        """Return motor -> mm (deg) of it per mm (deg) of `axis`, a motor or a virtual
-        axis.
-
-        For a motor it is {axis: 1.0}.
+        """Return motor -> mm or deg of it per unit of `axis`.
 
         Raises:
-            UnknownNameError: lists the machine's axes.
+            UnknownNameError: no such axis.
         """
         if axis in self.axes:
             return {axis: 1.0}
@@ -904,11 +901,7 @@ class Machine(_Frozen):
         return self.virtual_axes[axis].moves
 
     def counts(self, motor: str) -> float:
-        """Return how many units of a motor move some part by 1 mm, or turn it by 1 deg: 1
-        for motors in mm and deg, and for one that moves nothing.
-
-        What counts as rounding, in mm or deg, is so many times that of the motor. Of
-        several parts the one that it moves farthest counts."""
+        """Return the units of a motor that move the part it moves farthest by 1."""
         shares = (abs(of.get(motor, 0.0)) for of in self.geometry.values())
         return 1.0 / (max(shares, default=0.0) or 1.0)
 
@@ -951,20 +944,14 @@ def parse_machine(
 ) -> Machine:
     """Parse and validate a machine description, with its base and meshes.
 
-    `base = NAME` at the top of the text inherits everything else from a machine that
-    ships, except its zero offsets and the axes and components that `without` lists.
-    Tables are merged key by key and components by their names; a quantity of `geometry`
-    and `timing` are replaced entirely.
-
-    Args:
-        text: TOML.
-        file: name for error messages.
-        corners: reads the meshes that it names (`flexdt.library.machines.parsed` reads
-            those beside the file); None: meshes are an error.
+    `base = NAME` inherits everything else from a shipped machine, except its zero offsets
+    and the axes and components that `without` lists. Tables are merged by key, components
+    by name; a quantity of `geometry` and `timing` are replaced.
+    `corners`: reads the meshes that it names; None: they are an error.
 
     Raises:
         MachineFileError: TOML or content is invalid, a motor moves nothing, or none turns
-            the sample; file, key path, value, allowed values.
+            the sample.
     """
     machine = _parse(Machine, lambda own: _inherited(_meshed(own, corners)), text, file)
     driving = {name for factors in machine.geometry.values() for name in factors}
@@ -1014,18 +1001,9 @@ def builtin_machine_text(name: str) -> str:
 
 
 def profile_of(machine: Machine, name: str | None = None) -> Profile:
-    """Load the shipped profile `name`, or the default of a machine, or make one of zero
-    offsets.
+    """Load the shipped profile `name` (None, "": the machine's default), or zero offsets.
 
-    Zero offsets, called `ZERO`, are for a machine without a default and no name, "" or
-    `ZERO`. Whether a named profile is of this machine is not checked.
-
-    Args:
-        machine: whose default is taken.
-        name: of a profile; None or "": the default.
-
-    Raises:
-        UnknownNameError: no such profile ships; lists those that do.
+    Whether it is of this machine is not checked. Raises UnknownNameError: none such.
     """
     chosen = name or machine.default_profile
     if chosen in ("", ZERO) and not machine.default_profile:
@@ -1061,10 +1039,7 @@ def builtin_machines() -> tuple[str, ...]:
 
 
 def builtin_profiles(machine: str | None = None) -> tuple[str, ...]:
-    """List the names of the shipped profiles, sorted: those of `machine`, or (None) of
-    all machines.
-
-    For a machine the profiles are read; an unknown machine gives ()."""
+    """List the names of the shipped profiles, sorted, of a machine or all."""
     names = _names("profiles")
     return tuple(
         n for n in names if machine is None or builtin_profile(n).machine == machine
@@ -1248,18 +1223,11 @@ def _without_part(parts: list[Raw], name: object) -> list[Raw]:
 
 
 def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
-    """Merge a machine's content into that of its base, key by key.
+    """Merge a machine's content into that of its base, key by key, in a new table.
 
-    In `geometry` each quantity is replaced whole, elsewhere a table `moves`; components are
-    merged by name (`_merged_parts`). Merged tables say in `source` which values come from the
-    file (`_credit`).
-
-    Args:
-        base: content of the base; unchanged.
-        own: content of the file, whose values go before the base's.
-        whole: keys whose tables are replaced; others are merged.
-
-    Returns a new table; values of both are shared.
+    In `geometry` each quantity is replaced whole, elsewhere a table `moves`, and those of
+    `whole`; components are merged by name. Merged tables say in `source` which values
+    come from the file (`_credit`).
     """
     out = dict(base)
     for key, value in own.items():
@@ -1298,10 +1266,11 @@ def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
 
 
 def _credit(merged: Raw, old: Raw, own: Raw) -> None:
-    """Write into `merged["source"]` which keys come from this file, and the base's source for
-    the others. Does nothing if this file has no values or a source of its own, or the base has
-    no `source`. An empty source of the base becomes "as the base has it". `merged`: table that
-    is changed in place; `old`: of the base; `own`: of the file."""
+    """Write into `merged["source"]` which keys come from this file; else the base's
+    source.
+
+    Without values here, a source here or none in the base, nothing is done.
+    """
     if own and isinstance(old.get("source"), str) and "source" not in own:
         keys = ", ".join(key for key in own if key != "name")
         merged["source"] = (
@@ -1373,12 +1342,9 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
 
 
 def _limit(path: str) -> str:
-    """Return the limitation of the twin that a key comes from, as the end of an error message,
-    or "".
+    """Return the limitation of the twin that a key comes from, or "".
 
-    The text is of the first of `_KEY_LIMITS` with which the last part of `path`, case ignored,
-    begins, and refers to docs/limits.md.
-    `path`: of the key, parts separated by dots.
+    It ends the error's message.
     """
     last = path.rpartition(".")[2].lower()
     limit = next(
@@ -1392,11 +1358,10 @@ def _limit(path: str) -> str:
 def _require(
     names: Iterable[str], allowed: Iterable[str], where: str, what: str, more: str = ""
 ) -> None:
-    """Raise the error of `_refused` for the first of `names` that is not in `allowed`.
+    """Raise the error of `_refused` for the first of `names` that is not allowed.
 
-    The message lists the allowed ones, or that there is none.
-    `names`: to check; `allowed`: names; `where`: key path of the error; `what`: noun of the
-    message, such as "axis"; `more`: end of the message."""
+    `where`: key path; `what`: noun, such as "axis".
+    """
     valid = list(allowed)
     for name in names:
         if name not in valid:

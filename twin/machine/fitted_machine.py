@@ -23,14 +23,11 @@ def fitted_text(
     axes: Collection[str],
     parse: Callable[[str, str], Machine] = parse_machine,
 ) -> str:
-    """Write the timing and some axes of `machine` into the machine file `text`, comments kept.
+    """Write the timing and some axes of `machine` into the machine file `text`.
 
-    `text`: TOML of the machine that was fitted; `machine`: the fitted one; `axes`: names of the
-    axes that are replaced, all in `machine`; `parse`: reads a machine file's text, with its
-    meshes if it has any.
-    Returns TOML.
-    Raises MachineFileError: the new text does not parse to `machine`, for instance because the
-    file does not write its axes and times as tables.
+    Comments are kept. `parse`: reads a file's text, with its meshes. Raises
+    MachineFileError: the new text does not parse to `machine`, for instance because its
+    axes and times are not tables.
     """
     blocks = {f"axes.{name}": _axis_table(name, machine.axes[name]) for name in axes}
     new_text = _replaced(text, {**blocks, "timing": _timing_table(machine.timing)})

@@ -53,15 +53,10 @@ def poses(
     camera: CameraSettings,
     positions: Mapping[str, npt.ArrayLike],
 ) -> Poses:
-    """Compute nominal poses for motor positions, all checked to be within their travel;
-    see `motor_poses`.
+    """Compute nominal poses for motor positions within travel; see `motor_poses`.
 
-    A motor without values (an empty array) is not checked. Positions beyond a limit by
-    rounding alone pass.
-
-    Raises:
-        UnknownNameError: a motor the machine does not have.
-        LimitError: a position outside the motor's travel.
+    Rounding beyond passes. Raises UnknownNameError: no such motor; LimitError: a position
+    outside.
     """
     for name, values in positions.items():
         for extreme in (np.min(values), np.max(values)) if np.size(values) else ():
@@ -195,19 +190,10 @@ def motor_targets(
     *,
     relative: bool = False,
 ) -> dict[str, float]:
-    """Compute the motor targets of a move of `axis`, without regard to limits.
+    """Compute the motor targets [mm, deg] of a move of `axis`, without regard to limits.
 
-    The motors of a virtual axis move by their shares of the displacement.
-
-    Args:
-        machine: whose axes these are.
-        axis: motor or virtual axis.
-        value: absolute target [mm, deg], or a displacement when `relative`.
-        positions: motor -> reading [mm, deg].
-        relative: read `value` as a displacement.
-
-    Returns:
-        Motor -> target [mm, deg].
+    The motors of a virtual axis move by their shares of the displacement; `value` is one
+    if `relative`. `positions`: motor -> reading.
 
     Raises:
         UnknownNameError: no such axis.

@@ -51,12 +51,10 @@ def require_causes(names: Iterable[str]) -> tuple[str, ...]:
 def limits_of(
     scanners: Iterable[Mapping[str, float]], given: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return the largest standard deviation that each cause may have, 0: it cannot be.
+    """Return the largest standard deviation that each cause may have, 0: none.
 
-    Args:
-        scanners: priors of each scan's scanner; a cause is limited if all limit it, to the
-            widest.
-        given: those of a user, which count instead.
+    A cause is limited if all `scanners` limit it, to the widest; a user's `given` counts
+    instead.
     """
     every = list(scanners)
     out = {

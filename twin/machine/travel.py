@@ -55,16 +55,11 @@ class Arrival:
 
 
 def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arrival:
-    """Apply the rule for targets beyond a limit to a move of `axis`: move targets into the
-    travel and say which lay beyond; raises nothing.
+    """Apply the rule for targets beyond a limit to a move of `axis`; raises nothing.
 
-    Beyond is by more than `POSITION_ROUNDING`; motors of a virtual axis are shortened together
-    (`clamp`).
-
-    `machine`: whose motors these are; `axis`: motor or virtual axis that is moved; `targets`:
-    motor -> requested target [mm, deg].
-    Returns targets within the travel, a message for each that lies beyond, and the error of the
-    first that lies beyond by more than its axis's `arrival_tolerance`, or None.
+    Beyond is by more than `POSITION_ROUNDING`; motors of a virtual axis are shortened
+    together (`clamp`). Returns targets within the travel, a message for each beyond, and
+    the error of the first beyond by more than its axis's `arrival_tolerance`, or None.
     """
     messages = []
     beyond = None
@@ -125,20 +120,9 @@ def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
 
 
 def check_target(machine: Machine, axis: str, value: float) -> float:
-    """Check that `value` is within the travel of motor `axis`.
+    """Check that a motor's `value` [mm, deg] is within its travel.
 
-    Args:
-        machine: with the motor.
-        axis: a motor; virtual axes are unknown here.
-        value: a target [mm, deg].
-
-    Returns:
-        The value; the limit, if it is beyond that by at most `POSITION_ROUNDING`.
-
-    Raises:
-        LimitError: names axis, value, unit and limits; also for a value that is no
-            number.
-        UnknownNameError: no such motor.
+    Within rounding it is the limit. Raises LimitError, UnknownNameError.
     """
     a = machine.axis(axis)
     if not distance_beyond(machine, axis, value) <= POSITION_ROUNDING:
@@ -147,13 +131,10 @@ def check_target(machine: Machine, axis: str, value: float) -> float:
 
 
 def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str, float]:
-    """Return the targets of an axis's motors, moved into their travel.
+    """Return the targets [mm, deg] of an axis's motors, moved into their travel.
 
-    If a motor of a virtual axis is cut short, all its motors give up the same displacement of
-    the axis, the largest that one needs, and are then limited once more.
-
-    `targets`: motor -> target [mm, deg]; for a virtual axis those of all its motors. `axis`:
-    motor or virtual axis that is moved.
+    If a motor of a virtual axis is cut short, all give up the same displacement of the
+    axis, the largest that one needs, and are limited again.
     """
     bounded = _bounded(machine, targets)
     if axis in machine.axes or bounded == targets:

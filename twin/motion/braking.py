@@ -67,21 +67,10 @@ class _Cell:
 
 
 def braked_along(drives: Drives, now: float, most: Most = None) -> dict[str, Trajectory]:
-    """Slow everything under way to rest on the path it is on.
+    """Slow everything under way to rest on the path it is on, from `now` [s].
 
-    The motors keep their common path and pass it ever more slowly. While a motor brakes
-    with all it may use, the programme's time cannot slow, so that this may take longer
-    than stopping each motor by itself.
-
-    Args:
-        drives: every motor with all that it is to follow.
-        now: from when on [s].
-        most: motor -> greatest acceleration [mm/s2, deg/s2], of every motor; the motion
-            in force may have more. None: that of the motion in force.
-
-    Returns:
-        Motor -> trajectory from `now` on, of those that had anything left to do.
-        Positions stray from the path by at most `PATH_TOLERANCE`.
+    A motor that brakes with all it may use holds up the common path. `most`: greatest
+    accelerations. Deviation: `PATH_TOLERANCE`.
     """
     due = {name: drive for name, drive in drives.items() if drive.end > now}
     cells = _cells(due, now, most)
@@ -176,11 +165,10 @@ def coasting(
 
 
 def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
-    """Compute the programme time [s] to which a stop along the path, begun at `at`, advances.
+    """Compute the programme time [s] that a stop along the path from `at` reaches.
 
-    It is not after the end of the programme that is left. Returns `at` if nothing moves then.
-    `drives`: every motor with all that it is to follow; `at`: start of braking [s]; `most`: as
-    for `braked_along`."""
+    It is `at` if nothing moves then.
+    """
     due = {name: drive for name, drive in drives.items() if drive.end > at}
     cells = _cells(due, at, most)
     if cells:
@@ -191,13 +179,11 @@ def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
 def braked_at(
     drives: Drives, at: float, trajectories: Mapping[str, Trajectory], most: Most
 ) -> dict[str, Drive]:
-    """Return `drives` that follow `trajectories` up to `at` and brake along their common path
-    from then on.
+    """Return drives that follow `trajectories` up to `at` and then brake along their
+    path.
 
-    Drives that have nothing left to do at `at` are not braked.
-    `drives`: motors; not changed. `at`: start of braking [s]. `trajectories`: motor ->
-    trajectory, which replaces all that this motor was to follow. `most`: as for `braked_along`.
-    Returns motor -> drive, of all motors.
+    A trajectory replaces all that its motor was to follow; one with nothing left to do is
+    not braked. `most`: as for `braked_along`.
     """
     following = {**drives, **{n: drives[n].following(t) for n, t in trajectories.items()}}
     braked = braked_along(following, at, most)
@@ -210,11 +196,11 @@ def braked_at(
 
 
 def _coupled(machine: Machine, velocity: Mapping[str, float]) -> Iterable[list[str]]:
-    """Yield, for each virtual axis whose motors move in step now, the names of its motors.
+    """Yield the motors of each virtual axis whose motors move in step now.
 
-    In step: their velocities divided by their shares agree within `STEP_TOLERANCE` of the
-    fastest, and are not all 0. `machine`: with the virtual axes. `velocity`: motor -> velocity
-    [mm/s, deg/s]; 0 for those left out."""
+    Their velocities [mm/s, deg/s] over their shares agree within `STEP_TOLERANCE` of the
+    fastest, not all 0.
+    """
     for virtual in machine.virtual_axes.values():
         rates = [velocity.get(name, 0.0) / share for name, share in virtual.moves.items()]
         fastest = max(map(abs, rates))
@@ -223,10 +209,7 @@ def _coupled(machine: Machine, velocity: Mapping[str, float]) -> Iterable[list[s
 
 
 def greatest(name: str, leg: Trajectory, time: float, most: Most) -> float:
-    """Return the acceleration that a motor may brake with at `time` while it follows
-    `leg` [mm/s2, deg/s2].
-
-    It is the largest that `leg` has from then on, or that of `most` if greater."""
+    """Return the acceleration that a motor may brake with while it follows `leg`."""
     planned = leg.acceleration(time)
     if most is None:
         return planned
@@ -315,17 +298,14 @@ class _State:
         return abs(self.velocity) / self.counts
 
     def slowing(self, rate: float, ahead: float) -> float:
-        """Compute by how much programme time may slow, at a constant rate, without exceeding the
-        acceleration that the motor may use.
+        """Compute how fast programme time may slow within the motor's acceleration [1/s].
 
-        The acceleration that the motor has by itself counts: braking leaves less for the
-        slowing, speeding up more; 0 if braking leaves nothing.
+        The motor's own acceleration counts: braking leaves less for the slowing, speeding
+        up more. inf without velocity now and `ahead`.
 
         Args:
             rate: of programme time at the start, programme seconds a second.
             ahead: programme seconds over which the slowing is constant.
-
-        Returns the greatest slowing [1/s]; inf for a motor without velocity now and `ahead`.
         """
         speed = abs(self.velocity)
         a = abs(self.acceleration)
@@ -343,14 +323,9 @@ class _State:
 
 
 def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
-    """Evaluate a motor at programme time `s`: velocity, acceleration, the acceleration
-    that it may use, and until when that holds.
+    """Evaluate a motor at programme time `s`, and until when that holds.
 
-    It holds to the end of the piece, the moment at which the motor turns round, or the
-    start of the next trajectory.
-
-    Args:
-        most: as for `braked_along`.
+    It ends with the piece, at a turn, or at the next trajectory.
     """
     leg = drive.at(s)
     velocity, acceleration, until = leg.law(s)

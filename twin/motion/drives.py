@@ -126,12 +126,10 @@ def clock_left(now: float) -> float:
 
 
 def require_time(what: str, end: float, now: float) -> None:
-    """Check that a motion ends before the clock does: its steps would be too coarse for
-    what was swept.
+    """Check that a motion ends before the clock does, whose steps would be too coarse.
 
-    `what`: the command, for the message. `end`: of the motion [s]; one without an end
-    passes, as a renewed jog. `now`: time of the command [s]. Raises LimitError: it ends
-    more than `LATEST_MOTION_S` after `LATE_S` and now.
+    `end` [s] may be inf, as of a renewed jog. Raises LimitError: `what` ends more than
+    `LATEST_MOTION_S` after `LATE_S` and now.
     """
     last = now + clock_left(now)
     if last < end < math.inf:
@@ -165,20 +163,14 @@ def plan_move(
     relative: bool = False,
     shortest: bool = False,
 ) -> dict[str, Trajectory]:
-    """Plan the motions to `targets` of the motors that these move; all begin now, from the
-    present motion.
+    """Plan the motions to `targets` of the motors that these move; all begin now.
 
     Motors of a virtual axis get paces in proportion, so that from rest they keep in step;
-    acceleration is at least that of the motion in force. `shortest` is ignored for relative
-    targets.
-
-    `machine`: whose motors these are; `drives`: every motor; `targets`: axis (motor or virtual)
-    -> position, or displacement [mm, deg]; `now`: time of the command [s]; `relative`: targets
-    are displacements from where the motors are bound for; `shortest`: rotations go the shorter
-    way round to an equivalent angle (thesis 4.5.2).
-    Returns motor -> trajectory, of those that `targets` moves.
-    Raises UnknownNameError: no such axis; LimitError: a target outside its travel by more than
-    the tolerance, or two targets of one motor.
+    acceleration is at least that in force. `relative`: displacements from where motors
+    are bound for; `shortest`: rotations to an equivalent angle the shorter way (thesis
+    4.5.2), if not relative. Targets are axis -> [mm, deg].
+    Raises UnknownNameError: no such axis; LimitError: a target outside travel by more
+    than the tolerance, or two of one motor.
     """
     bound = {name: d.at(now).target for name, d in drives.items()}
     _refuse_double(machine, targets)
@@ -378,11 +370,9 @@ def _paces(
 
 
 def _shortest(axis: Axis, position: float, target: float) -> float:
-    """Find the angle equivalent to `target`, by full turns, nearest to `position` and
-    within travel [deg].
+    """Find the angle equivalent to `target` nearest to `position` in travel [deg].
 
-    `target` unchanged for a linear axis, or if the nearest equivalent angle and those a
-    turn beside it are outside travel.
+    A linear axis' target stays.
     """
     match axis.kind:
         case "linear":

@@ -143,10 +143,9 @@ class Trajectory:
         return velocity, a, until
 
     def acceleration(self, time: float) -> float:
-        """Return the largest absolute acceleration from `time` on, which braking was
-        planned with [mm/s2, deg/s2].
+        """Return the largest absolute acceleration from `time` on [mm/s2, deg/s2].
 
-        Before the start that of the whole motion; after the end 0.
+        Before the start of the whole motion; after the end 0.
         """
         if time >= self.end:
             return 0.0
@@ -237,14 +236,7 @@ class AxisPath(ArrayValue):
     def of(
         cls, start: float, trajectories: Sequence[tuple[float, Trajectory]]
     ) -> AxisPath:
-        """Join trajectories, each in force from its own start until the next one's, after
-        rest at `start`.
-
-        Args:
-            start: position of the rest, from time 0 [mm, deg].
-            trajectories: (time, trajectory) in the order of their starts; the times are
-                not used.
-        """
+        """Join (time, trajectory) in order, after rest at `start`."""
         return cls.along(joined([at_rest(start), *(later for _, later in trajectories)]))
 
     @classmethod

@@ -62,9 +62,9 @@ def noise_kernel(sigma_px: float) -> Float32Array:
 
 
 def noise_spectrum(frequency: FloatArray, sigma_px: float) -> FloatArray:
-    """Compute the noise power of a flat image by frequency [cycles a pixel], 1 at none:
-    light's (a Gaussian of `sigma_px`) and aperture's modulation squared, with the
-    `FOLDED_SPECTRA` next frequencies on either side folded back.
+    """Compute a flat image's noise power by frequency [cycles a pixel], 1 at none.
+
+    Light's and aperture's modulation squared, frequencies folded back.
     """
     f = frequency[..., None] + np.arange(-FOLDED_SPECTRA, FOLDED_SPECTRA + 1)
     return np.asarray(
@@ -112,15 +112,11 @@ def blurred(
 
 
 def spot_blur_px(view: FloatArray, spot_mm: float, towards_mm: float = 0.0) -> float:
-    """Compute the standard deviation of the focal spot's image for a point at the rotation axis,
-    or `towards_mm` nearer to the source [pixels along u].
+    """Compute the focal spot's blur (standard deviation) at the axis [pixels along u].
 
-    Not negative; points at the source or behind it count as at 1e-3 of the axis's distance.
-
-    Args:
-        view: cone_vec row (12,) [mm].
-        spot_mm: focal spot, full width at half maximum [mm].
-        towards_mm: distance from the axis towards the source [mm].
+    For a point `towards_mm` nearer to the source; points at the source or behind it count
+    as at 1e-3 of the axis's distance. `view`: cone_vec row (12,) [mm]; `spot_mm`: full
+    width at half maximum.
     """
     source = view[0:3]
     centre = view[3:6]

@@ -68,12 +68,12 @@ def beam_of(chain: Chain, kV: float) -> EffectiveBeam:
 
 
 def weights_of(chain: Chain, kV: float) -> tuple[FloatArray, FloatArray]:
-    """Compute the contribution of each energy to an open pixel's electrons and their variance.
+    """Compute each energy's part in an open pixel's electrons and their variance, (e,)
+    both.
 
-    The variance is that of a compound Poisson process: photons are counted, each gives a spread
-    amount of charge. With `mono_keV` all photons have this energy, as many as give the full
-    spectrum's signal. `chain`: tube and panel; `kV`: tube voltage [kV]. Returns (e,) both, per
-    cm2 of pixel and mAs, 1 m from the source."""
+    Per cm2 of pixel and mAs, 1 m from the source; a compound Poisson process. With
+    `mono_keV` all photons have this energy, as many as give the full spectrum's signal.
+    """
     charge, variance = chain.panel.charge_of_photons()
     fluence = tube_spectrum(kV, chain.tube).fluence
     if chain.mono_keV is not None:
@@ -110,16 +110,10 @@ class PixelPaths:
 def transmitted(
     beam: EffectiveBeam, paths_mm: Float32Array, areas: PixelPaths | None = None
 ) -> tuple[Float32Array, Float32Array]:
-    """Compute the signal behind path lengths, and its variance, averaged over the rays of the
-    pixels that have several.
+    """Compute the signal behind path lengths [mm], and its variance, (..., rows, cols).
 
-    Args:
-        beam: its effective energies.
-        paths_mm: float32 (m, ..., rows, cols), to the pixels' centers [mm].
-        areas: pixels of (..., rows, cols) that have several rays.
-
-    Returns:
-        Two float32 arrays (..., rows, cols), in the units of `EffectiveBeam.transmit`.
+    `paths_mm`: (m, ..., rows, cols), to the pixels' centers. `areas`: pixels with several
+    rays, whose mean is taken. Units are those of `EffectiveBeam.transmit`.
     """
     mean, variance = beam.transmit(paths_mm)
     if areas is not None and len(areas.within.pixels):
@@ -247,13 +241,12 @@ def flux_map(
     pixel_v: float,
     shape: tuple[int, int],
 ) -> Float32Array:
-    """Compute pixel area [cm2] times inverse square of the distance relative to 1 m, times the
+    """Compute pixel area [cm2] times the inverse square of the distance to 1 m, times
     obliquity.
 
-    `distance`: from the source to the panel's plane [mm]; `foot_u` and `foot_v`: foot point of
-    the source, from the panel's center along u and v [mm]; `pixel_u` and `pixel_v`: pitch [mm];
-    `shape`: (rows, cols).
-    Returns float32 (rows, cols), read-only; the last 16 are kept.
+    From a source `distance` [mm] before its foot point, (`foot_u`, `foot_v`) from the
+    panel's center; pixels have the pitch `pixel_u`, `pixel_v` [mm]. Returns (rows, cols),
+    read-only; the last 16 are kept.
     """
     rows, cols = shape
     y = (np.arange(rows) - (rows - 1) / 2) * pixel_v - foot_v
@@ -326,20 +319,17 @@ def radiographs(
     scatter: Sequence[Scattered] = (),
     areas: PixelPaths | None = None,
 ) -> list[Radiograph]:
-    """Compute the images of several exposures, as if X-rays were on. Distances, flux and
-    blur of an exposure are those of its middle view.
+    """Compute the images of n exposures, as if X-rays were on: line integrals and
+    electrons.
+
+    Distances, flux and blur of an exposure are those of its middle view.
 
     Args:
-        chain: tube, materials, panel.
         paths_mm: float32 (m, n * moments, rows, cols), one channel a material [mm].
         views: (n * moments, 12) their cone_vec rows [mm].
-        exposures: tube and time of each of the n images.
         moments: views spread over each exposure.
         scatter: of each image; none if left out.
         areas: pixels, of all views, whose signal is the mean of several rays'.
-
-    Returns:
-        Line integrals and expected electrons of each image, in order.
     """
     images = []
     for i, given in enumerate(exposures):

@@ -211,9 +211,10 @@ def sample_paths(
 def _relative(
     paths: FloatArray, mu: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute each energy's contribution behind `paths`, (j, e), and their sum, (j,),
-    relative to that sum, so that the latter is 1; a sum below `MIN_TRANSMISSION` of the
-    open beam's counts as that."""
+    """Compute each energy's contribution behind `paths`, (j, e), and their sum, (j,).
+
+    Both are relative to that sum, or to `MIN_TRANSMISSION` of the open beam's.
+    """
     columns = np.exp(-paths @ mu) * weights
     total = columns.sum(axis=1)
     scale = 1.0 / np.maximum(total, MIN_TRANSMISSION * weights.sum())

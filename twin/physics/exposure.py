@@ -90,14 +90,9 @@ def ideal_response(machine: Machine) -> IdealResponse:
 
 
 def open_beam(model: IdealResponse, settings: ExposureSettings) -> float:
-    """Compute the signal above dark of a ray that meets nothing, proportional to voltage, power
-    and time.
+    """Compute the counts above dark of a ray that meets nothing; 0 with X-rays off.
 
-    Args:
-        model: signal at its reference settings.
-        settings: voltage [kV], power [W], exposure [ms].
-
-    Returns counts; 0 with X-rays off.
+    They are proportional to voltage, power and time.
     """
     if not settings.xrays_on:
         return 0.0

@@ -56,13 +56,12 @@ def pixel_reading(
     paths_mm: Sequence[float] = (),
     detail: tuple[Substance, float] | None = None,
 ) -> PixelValue:
-    """Forecast the count of a pixel behind materials, and its noise in a saved image, in
-    surroundings that are like it; without scatter and focal-spot blur.
+    """Forecast the count of a pixel behind materials and its noise, in surroundings like
+    it.
+
+    Without scatter and focal-spot blur.
 
     Args:
-        chain: tube, materials, panel.
-        camera: its mode determines how pixels are binned and read.
-        exposure: tube, time and averages.
         flux: the pixel's share of the charge at 1 m, see `chain.flux_map` [cm2].
         paths_mm: path through each of the chain's substances [mm]; nothing if left out.
         detail: one more substance and the path through it [mm].
@@ -72,18 +71,6 @@ def pixel_reading(
 
     Raises:
         LimitError: the tables have no spectrum for the voltage.
-
-    Example:
-        >>> from flexdt.twin.machine.camera import Roi
-        >>> from flexdt.twin.physics.detector import Detector
-        >>> from flexdt.twin.physics.tube import TubeModel
-        >>> aluminium = Substance.of("aluminium", "Al", 2.7)
-        >>> chain = Chain(Detector(), TubeModel(), (aluminium,), (50.0,))
-        >>> camera = CameraSettings("HW2SW1High", Roi(32, 8, 1943, 1527))
-        >>> behind = [pixel_reading(chain, camera, ExposureSettings(90.0, 50.0, 100.0), 2e-4, [x])
-        ...           for x in (0.0, 20.0)]
-        >>> behind[0].signal > 5 * behind[1].signal, behind[0].noise > behind[1].noise
-        (True, True)
     """
     if paths_mm:
         layers = list(zip(chain.substances, paths_mm, strict=True))
@@ -113,17 +100,11 @@ def contrast_to_noise(background: PixelValue, detail: PixelValue) -> float:
 
 
 def air_kerma_mGy(chain: Chain, exposure: ExposureSettings, distance_mm: float) -> float:
-    """Compute the air kerma of one image at a distance from the source, with
-    nothing in between [mGy].
+    """Compute the air kerma of one image at a distance from the source [mGy].
 
-    The energy that photons give to electrons of air: all of it in photoelectric
-    absorption, the electron's mean share (Klein and Nishina) in Compton scattering.
-    Bremsstrahlung of those electrons, below 0.1 % here, is left in.
-
-    Args:
-        chain: its tube counts.
-        exposure: tube, time and averages.
-        distance_mm: source to the point [mm].
+    Energy that photons give to electrons of air: all of it in photoelectric absorption,
+    the mean share (Klein and Nishina) in Compton scattering; with bremsstrahlung, below
+    0.1 %.
     """
     spectrum = tube_spectrum(exposure.kV, chain.tube)
     fluence = (

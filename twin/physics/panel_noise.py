@@ -120,12 +120,10 @@ that spread first."""
 def drawn(
     exposed: Exposed, rng: np.random.Generator, *, spreads: bool
 ) -> Iterator[Float32Array]:
-    """Draw the noise of each term of `NOISE` that spreads with light, blurred by the panel, or
-    of each that does not.
+    """Draw the noise of each term of `NOISE` that spreads with light, or does not.
 
-    `exposed`: electrons, panel and camera. `rng`: source of random numbers. `spreads`: True: the
-    terms that spread; False: the others.
-    Yields electrons of a saved image, float32 (rows, cols), one array a term.
+    Spreading terms are blurred by the panel. Yields electrons of a saved image, (rows,
+    cols).
     """
     for term in NOISE:
         if term.spreads != spreads:
@@ -140,12 +138,11 @@ def drawn(
 def pixel_variance(
     panel: Detector, camera: CameraSettings, averages: int, xrays_e2: float
 ) -> float:
-    """Add up the variance of a pixel of a saved image in surroundings that are like it
-    [counts^2], the rounding to whole counts included.
+    """Add up the variance of a saved image's pixel in surroundings like it [counts^2].
 
-    `panel`: the detector; `camera`: its mode determines how pixels are binned and read;
-    `averages`: read-outs that are averaged into the image; `xrays_e2`: variance that X-rays have
-    in one read-out before light spreads [electrons^2]."""
+    Rounding is included. `averages`: read-outs in the image; `xrays_e2`: X-rays' variance
+    in one, before light spreads [electrons^2].
+    """
     kept_share = _kept_by_blur(panel.blur_px(camera))
     electrons = 0.0
     for term in NOISE:
@@ -155,11 +152,10 @@ def pixel_variance(
 
 
 def _kept_by_blur(sigmas_px: tuple[float, float]) -> float:
-    """Compute the part of a flat image's white noise that remains in a pixel where light
-    spreads, 0 to 1.
+    """Compute the part of white noise that remains in a pixel where light spreads.
 
-    `sigmas_px`: standard deviations of the light's spread along rows and across; if both are
-    below `MIN_SIGMA_PX` the part is 1."""
+    1 if both sigmas are below `MIN_SIGMA_PX`.
+    """
     if max(sigmas_px) < MIN_SIGMA_PX:
         return 1.0
     return math.prod(

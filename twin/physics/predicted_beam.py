@@ -120,19 +120,9 @@ def counts_behind(
     view: npt.ArrayLike,
     pixels_a_side: int = 1,
 ) -> Float32Array:
-    """Predict the counts above dark of an image without noise, not clipped.
+    """Predict the counts above dark without noise, (rows, cols), not clipped.
 
-    Args:
-        chain: tube, materials, panel.
-        camera: its mode decides the electrons in a count.
-        exposure: tube and time; X-rays are on.
-        paths_mm: path through each of the chain's substances, float32 (m, rows, cols)
-            [mm].
-        view: cone_vec row (12,) of these pixels.
-        pixels_a_side: of the camera, along each side of one of these pixels.
-
-    Returns:
-        Of one pixel of the camera in the place of each of these, float32 (rows, cols).
+    `paths_mm`: (m, rows, cols), of each substance; `pixels_a_side`: camera pixels.
     """
     charge = expected_signal(chain, paths_mm, view, exposure).mean_e
     return expected_counts(chain.panel, camera, charge / np.float32(pixels_a_side**2))
@@ -145,13 +135,11 @@ def open_beam_of(
     view: npt.ArrayLike,
     physics: Physics = "poly",
 ) -> OpenBeam | None:
-    """Predict the open beam of one image: the counts of its brightest pixel above dark, and
-    those at which it saturates.
+    """Predict the open beam's counts above dark in its brightest pixel, and at
+    saturation.
 
-    `machine`: its tube and detector. `camera`: mode and region of interest. `exposure`: tube and
-    time; taken as if X-rays were on. `view`: cone_vec row (12,): distances and pixel size.
-    `physics`: how the counts are made; mono has the counts of poly.
-    Returns the open beam; None where mono or poly have no spectrum for the voltage.
+    As if X-rays were on; `view`: cone_vec row (12,). mono has the counts of poly. None
+    where there is no spectrum for the voltage.
     """
     match physics:
         case "ideal":

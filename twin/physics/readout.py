@@ -121,12 +121,10 @@ def trapped_after(
     exposure: ExposureSettings,
     gap_s: float,
 ) -> Float32Array:
-    """Compute the electrons in traps when the next frame starts, (rows, cols): earlier ones
-    decay, and the frame adds the panel's long-lag part of its charge.
+    """Compute the electrons in traps when the next frame starts, (rows, cols).
 
-    `panel`: the detector. `trapped`: at the frame's start, (rows, cols). `expected`: expected
-    electrons of the frame; None in the dark. `exposure`: of the frame. `gap_s`: from its end to
-    the next frame's start [s].
+    Earlier ones decay, and the frame adds the panel's long-lag part of its charge
+    (`expected`; None: dark). `gap_s`: between the two frames.
     """
     left = trapped * np.float32(np.exp(-(exposure.duration_s + gap_s) / panel.long_lag_s))
     if expected is not None:

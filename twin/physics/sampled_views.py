@@ -42,12 +42,9 @@ def spot_views(rows: FloatArray, spot_mm: float, points: int) -> FloatArray:
 def edges_needed(
     rays: Rays, noise: float, blur_px: float, points: int = 1
 ) -> Need | None:
-    """Say what the pixels on edges need, of which signals are averaged; None for one ray a
-    pixel.
+    """Say what pixels on edges need; None for one ray a pixel.
 
-    Args:
-        rays: along each side of such a pixel; "auto" for an error below the noise.
-        noise, blur_px, points: as of `permitted_error`.
+    `rays`: a side; "auto": an error below the noise; others as `permitted_error`.
     """
     if rays == 1:
         return None
@@ -57,17 +54,11 @@ def edges_needed(
 
 
 def permitted_error(noise: float, blur_px: float, points: int = 1) -> float:
-    """Compute the error that a pixel on an edge may have, as a part of the open beam's signal
-    (standard deviation): `NOISE_SHARE` of the noise of the exposure.
+    """Compute the error that an edge may have, as a part of the open beam's signal
+    (sigma).
 
-    An edge's errors are averaged where the focal spot blurs it, over 2 sqrt(pi) standard
-    deviations of the blur, and over the points of the spot that are computed; each divides the
-    error by the root of its number.
-
-    Args:
-        noise: of a pixel of the open beam, relative to its signal.
-        blur_px: standard deviation of the spot's blur [pixels]; 0 where its points are computed.
-        points: of the focal spot.
+    `NOISE_SHARE` of `noise`, relative too, times the root of the points that average it:
+    over 2 sqrt(pi) sigmas of the blur, and of the spot.
     """
     averaged = max(1.0, 2.0 * np.sqrt(np.pi) * blur_px) * points
     error = min(NOISE_SHARE * noise * np.sqrt(averaged), LARGEST_ERROR)

@@ -493,12 +493,11 @@ def view_scatter(
     beam: Beam,
     settings: ScatterSettings,
 ) -> Scattered:
-    """Simulate the scatter of one view at every pixel, independent of other views.
+    """Simulate the scatter of one view at every pixel, independent of others.
 
-    `thing`: the object's voxels, in the frame of `view`. `view`: the cone_vec row (12,) [mm];
-    other views draw other photons, the same the same. `shape`: the panel's (rows, cols). `beam`:
-    spectrum and panel. `settings`: how; `step_deg` does not count.
-    Raises GeometryError: the source is beside or inside the object's box.
+    `view`: cone_vec row (12,) [mm], which alone determines its photons; `step_deg` of the
+    settings does not count. Raises GeometryError: the source is beside or inside the
+    object's box.
     """
     row = np.ascontiguousarray(view, dtype=np.float64)
     stream = int.from_bytes(blake2b(row.tobytes(), digest_size=8).digest(), "little")
@@ -574,9 +573,7 @@ def way_of(rows: FloatArray) -> FloatArray:
 
 
 def _views_to_simulate(way: FloatArray, step: float) -> Sequence[int]:
-    """Choose the views to simulate: first, last, and so many that no path between two is
-    longer than `step`, unless it is a single step from one view to the next; their
-    indices, ascending."""
+    """Choose the views to simulate, ascending: first, last, paths at most `step`."""
     chosen = [0]
     for i in range(1, len(way)):
         if i == len(way) - 1 or way[i + 1] - way[chosen[-1]] > step:

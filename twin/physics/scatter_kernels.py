@@ -178,15 +178,13 @@ def depth_of(paths: Any, mu: Any) -> float:
 
 @kernel
 def depth_drawn(number, depth):
-    """Draw the optical depth of a forced interaction on a path of optical depth `depth`, and its
-    weight.
+    """Draw an interaction's optical depth on a path of `depth` > 0, and its weight.
 
-    `number`: random, in [0, 1); `depth`: above 0.
-    Returns the depth, 0 to `depth`, and the weight. Half of the chance is the exponential's, cut
-    off at the far side; half is even, since a photon that goes on to the panel is weakened as
-    much wherever on the way it interacts. Without it thick objects would be sampled at their
-    entrance alone. Newton's steps from 0 invert the running chance, which is concave, from
-    below."""
+    `number`: random, in [0, 1). Half of the chance is the exponential's, cut off at the
+    far side; half is even, as a photon that goes on is weakened as much wherever it
+    interacts. Newton's steps from 0 invert the running chance, which is concave, from
+    below.
+    """
     hit = -math.expm1(-depth)
     t = 0.0
     for _ in range(12):

@@ -99,14 +99,7 @@ def warn_of(
     findings: Iterable[Finding],
     error: type[TwinError] = TwinError,
 ) -> None:
-    """Raise an error for an error among the findings as `settled` does; otherwise give a
-    Python warning (`PlausibilityWarning`, at the caller's line) for each finding that is a
-    warning.
-
-    Args:
-        findings: of one entry point.
-        error: type of error to raise.
-    """
+    """Raise the first error as `settled`, else warn of each warning."""
     for doubt in settled(findings, error):
         warn_caller(doubt, PlausibilityWarning)
 

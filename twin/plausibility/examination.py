@@ -109,10 +109,10 @@ def _found(
 
 
 def _values(images: Any, volume: npt.NDArray[Any] | None) -> Iterator[Finding]:
-    """Yield the findings of all checks of values: of a sample (`some_of`) of the images'
-    line integrals, then of the whole volume.
+    """Yield the findings on a sample of line integrals, then on the volume.
 
-    None, and images without any view, are not checked."""
+    Images without views are not checked.
+    """
     if images is not None and len(images):
         yield from integral_findings(some_of(images))
     if volume is not None:
@@ -120,10 +120,11 @@ def _values(images: Any, volume: npt.NDArray[Any] | None) -> Iterator[Finding]:
 
 
 def some_of(images: Any) -> npt.NDArray[Any]:
-    """Sample evenly spaced rows and columns of a few evenly spaced images. `images`: (n, rows,
-    cols), anything that is indexed by view. Returns array (k, r, c): at most `SOME_IMAGES`
-    images, first and last among them, of roughly `SOME_PIXELS` pixels each (all pixels of small
-    images)."""
+    """Sample rows and columns of a few images (n, rows, cols), evenly: (k, r, c).
+
+    At most `SOME_IMAGES`, first and last among them, of roughly `SOME_PIXELS` pixels
+    each.
+    """
     count, rows, cols = images.shape
     some = np.unique(np.linspace(0, count - 1, SOME_IMAGES).astype(int))
     each = max(1, int((rows * cols / SOME_PIXELS) ** 0.5))

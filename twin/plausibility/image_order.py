@@ -80,13 +80,10 @@ def ordered(names: Sequence[str]) -> Ordered:
 
 
 def _numbered(names: list[str]) -> Ordered | None:
-    """Sort names quickly if they differ only by a whole number of fixed width whose steps are
-    even.
+    """Sort names quickly if they differ only by a whole number in even steps.
 
-    `names`: sorted, without repetition.
-    Returns the names in that order, without findings. None for fewer than two names, names of
-    unequal length, several differing parts, uneven steps, or a number next to a sign, decimal
-    point or another number.
+    `names`: sorted, unique. None for fewer than two, unequal lengths, several differing
+    parts, or a number next to a sign, point or another number.
     """
     split = _split(names, DECIMAL)
     if split is None:
@@ -262,14 +259,10 @@ def _key(stem: str, *, signed: bool, decimals: bool) -> Key:
 def _decimal(
     decimal: dict[str, Key], whole: dict[str, Key], stems: dict[str, str]
 ) -> bool:
-    """Decide whether points in names are decimal points and not separators of numbers.
+    """Decide whether points in names are decimal points and not separators.
 
-    If decimal points make more names equal (1.1 and 1.10), they are only believed when they make
-    more texts equal. Otherwise True if all fractions have one width or none of several digits
-    ends in 0; False for names without points.
-
-    `decimal`: keys with decimal points, by name; `whole`: keys without; `stems`: names without
-    their endings, by name.
+    If decimal points make more names equal (1.1 and 1.10), only when they make more texts
+    equal. Else True if all fractions have one width or none of several digits ends in 0.
     """
     if len(set(decimal.values())) < len(set(whole.values())):
         return len(_texts(decimal)) < len(_texts(whole))
@@ -298,13 +291,7 @@ def _written_otherwise(names: Sequence[str], keys: dict[str, Key]) -> tuple[str,
 
 
 def _duplicates(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
-    """Yield at most one finding: a refusal on the first two names with equal keys, e.g.
-    `7.tif` and `007.tif`; nothing for names without numbers.
-
-    Args:
-        names: in order.
-        keys: their sort keys.
-    """
+    """Yield a refusal of the first two names with equal keys, as `7.tif`, `007.tif`."""
     seen: dict[Key, str] = {}
     for name in names:
         key = keys[name]

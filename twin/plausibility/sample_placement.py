@@ -112,18 +112,10 @@ def placement_findings(
 def _seen(
     places: FloatArray, ahead: npt.NDArray[np.bool_], shape: tuple[int, int]
 ) -> npt.NDArray[np.bool_]:
-    """Mark the views on whose panel a box may cast a shadow.
+    """Mark the views (n,) on whose panel a box may cast a shadow.
 
-    A box that the source's plane crosses may be anywhere and counts as seen; one behind
-    the source does not.
-
-    Args:
-        places: images of the box's 8 corners, (n, 8, 2) [px].
-        ahead: whether each corner is before the source, (n, 8).
-        shape: detector (rows, cols).
-
-    Returns:
-        (n,) bool.
+    `places`: its 8 corners' images [px], `ahead` of the source or not. One across the
+    source's plane counts as seen.
     """
     far = np.array(shape[::-1]) - 0.5
     overlap = (places.max(axis=1) > -0.5) & (places.min(axis=1) < far)

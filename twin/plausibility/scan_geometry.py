@@ -206,9 +206,7 @@ def radian_findings(angles: npt.ArrayLike) -> Iterator[Finding]:
 
 
 def _round_degrees(span: float, step: float) -> bool:
-    """Return whether a span, alone or with one step more, is a positive multiple of 5
-    (within 0.01); both in the same unit, degrees if the angles are [deg].
-    """
+    """Return whether a span [deg], or with a step more, is a multiple of 5."""
     return any(
         abs(whole / 5.0 - round(whole / 5.0)) < 2e-3 and whole > 0
         for whole in (span, span + step)

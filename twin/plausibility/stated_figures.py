@@ -110,12 +110,10 @@ def _wrapped(angle: FloatArray) -> FloatArray:
 
 
 def _worst(own: FloatArray, stated: FloatArray) -> float:
-    """Compute the largest difference of angles modulo a turn, for the better sense of rotation
-    and the mean difference as zero.
+    """Compute the largest difference of angles [rad] modulo a turn, in the better sense.
 
-    `own`: (n,) angles of the geometry [rad]; `stated`: (n,) stated angles [rad], in the same
-    order.
-    Returns difference [rad], at most pi."""
+    The mean difference counts as zero.
+    """
     found = []
     for sense in (1.0, -1.0):
         off = own - sense * stated

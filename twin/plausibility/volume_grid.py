@@ -105,10 +105,11 @@ def grid_findings(
 
 
 def _crossed(at: FloatArray, ahead: FloatArray, shape: tuple[int, int]) -> bool:
-    """Return whether the bounding box of the images of the grid's points meets the panel in some
-    view, so that a grid coarser than the panel counts as seen. `at`: images of the points, (n,
-    k, 2) [px]. `ahead`: whether each point is between source and panel, (n, k); others are
-    ignored. `shape`: detector (rows, cols)."""
+    """Return whether the bounding box of points' images meets the panel in some view.
+
+    `at`: (n, k, 2) [px]; others than `ahead`, (n, k), between source and panel, do not
+    count.
+    """
     far = np.array(shape[::-1]) - 0.5
     low = np.where(ahead[..., None], at, np.inf).min(axis=1)
     high = np.where(ahead[..., None], at, -np.inf).max(axis=1)

@@ -122,16 +122,10 @@ class Convex:
 
 
 def as_convex(shape: Shape) -> Convex:
-    """Convert one shape to its quadric and slabs, with its corners or semi-axes [mm];
-    equal shapes share one read-only result.
+    """Convert one shape to its quadric and slabs, with corners or semi-axes [mm].
 
-    Spheres and ellipsoids have semi-axes and no slabs; boxes, cylinders and polyhedra
-    have corners, whose convex hull holds them. Boxes and polyhedra have no quadric
-    (zeros). A slab is a normal (3), low and high end along it.
-
-    Raises:
-        GeometryError: a size is not positive, axes are not orthonormal, or a polyhedron
-            is not bounded.
+    A slab is a normal (3), low and high end along it. Raises GeometryError: a size, axes,
+    or an open polyhedron.
     """
     try:
         return _kept_convex(shape)
@@ -238,16 +232,7 @@ def shadows(
 def corner_shadows(
     corners: FloatArray, rays: FloatArray, shape: tuple[int, int]
 ) -> IntArray:
-    """Find the pixels that the convex hull of points can darken.
-
-    Args:
-        corners: (m, 3) [mm].
-        rays: (n, 12) as of `ConeVec.rays`.
-        shape: detector (rows, cols).
-
-    Returns:
-        (n, 4) as in `shadows`; all pixels when a point is not in front of the source.
-    """
+    """Find the pixels that the convex hull of points (m, 3) can darken, as `shadows`."""
     return _pixels(*_hull_ranges([corners], rays, _inverses(rays)), shape)[:, 0]
 
 

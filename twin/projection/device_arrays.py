@@ -47,10 +47,10 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     @classmethod
     def of_images(cls, images: Any) -> DeviceArray:
-        """Make an array of images (n, rows, cols): a copy of those on the host, the
-        shared memory of those on the device.
+        """Make an array of images (n, rows, cols), copied from the host, shared on the
+        device.
 
-        Raises DeviceError: the device failed.
+        Raises DeviceError.
         """
         if gpu.is_there(images):
             there = images

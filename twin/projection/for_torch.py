@@ -52,19 +52,15 @@ class TorchOperator:
         )
 
     def __call__(self, values: Any, rows: Any = None) -> Any:
-        """Project voxels, or spread projections if this is the adjoint.
+        """Project voxels, or spread projections if this is the adjoint; float32.
 
         Args:
-            values: (nz, ny, nx) [1/mm] or projections (n, rows, cols), with any number of
-                batch dimensions before them.
-            rows: the geometry as a tensor (n, 12) [mm], for all of the batch; with
-                `requires_grad` it gets the derivative. Take float64: single precision rounds
-                distances of a meter to 0.06 um, which is felt in sums over many pixels.
+            values: (nz, ny, nx) [1/mm] or (n, rows, cols), after batch dimensions.
+            rows: geometry tensor (n, 12) [mm] of all; its derivative needs float64, as
+                single precision rounds a meter to 0.06 um.
 
-        Returns float32 tensor, batch dimensions as given.
-        Raises GeometryError: a shape does not fit; NotBuiltError: a tensor is on a device other
-        than CUDA's, or a second derivative with respect to the geometry is requested;
-        DeviceError: the device failed; the log has the reason.
+        Raises GeometryError: a shape does not fit; NotBuiltError: a device other than
+        CUDA's, or a second derivative by geometry; DeviceError: the device failed.
         """
         values = _tensor(values)
         rows = _tensor(self.geometry.rows if rows is None else rows)
@@ -89,10 +85,9 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Any, rows: Any, a: TorchOperator) -> Any:
-        """Project a batch of volumes, on their device, and store them for `backward`.
+        """Project volumes (..., nz, ny, nx) on their device, and store them for
+        `backward`.
 
-        `ctx`: of torch; `x`: volumes (..., nz, ny, nx); `rows`: cone_vec (n, 12); `a`: the
-        operator, for grid and detector.
         Returns float32 (..., n, rows, cols).
         """
         ctx.save_for_backward(x, rows)
@@ -125,12 +120,11 @@ class _Spread(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, y: Any, rows: Any, a: TorchOperator) -> Any:
-        """Apply the transpose of the projection to a batch of images, on their device, and store
-        them for `backward`.
+        """Spread images (..., n, rows, cols) on their device, and store them for
+        `backward`.
 
-        `ctx`: of torch; `y`: images (..., n, rows, cols); `rows`: cone_vec (n, 12); `a`: the
-        operator, for grid and detector.
-        Returns float32 (..., nz, ny, nx)."""
+        Returns float32 (..., nz, ny, nx).
+        """
         ctx.save_for_backward(y, rows)
         ctx.a = a
         cone_vec = _cone_vec(rows)

@@ -141,9 +141,7 @@ def _project_one_ray() -> None:
 
 @contextmanager
 def switched_off() -> Iterator[None]:
-    """Switch the device off within the context, so that everything is computed on the
-    processor.
-    """
+    """Switch the device off in the context: the processor computes everything."""
     _failed.insert(0, Availability(False, "switched off"))
     try:
         yield
@@ -204,15 +202,12 @@ def has_room(needed: int) -> bool:
 
 
 def usable(voxel_bytes: int, images: Float32Array, threads: int, before: int = 0) -> bool:
-    """Return whether a device is there, has room for the voxels and one portion of images and,
-    if voxels must be moved to it, has at least `VIEWS_A_THREAD` views for each thread to do;
-    the views before count, too, for voxels of at least `WORTH_BYTES`.
+    """Return whether a device has room for voxels and a portion of images, and is worth
+    it.
 
-    Args:
-        voxel_bytes: size of the voxels to be moved there; 0 for voxels on the device.
-        images: (n, rows, cols).
-        threads: number of threads of the processor.
-        before: number of views of the same voxels that the processor has projected.
+    Voxels are moved for `VIEWS_A_THREAD` views a thread at least; `before`, views already
+    projected, count for those of `WORTH_BYTES`. `voxel_bytes` is 0 for voxels on the
+    device.
     """
     views = len(images) + (before if voxel_bytes >= WORTH_BYTES else 0)
     if not availability().present or (voxel_bytes and views < VIEWS_A_THREAD * threads):
@@ -307,10 +302,10 @@ def demand(work: Callable[[], Any]) -> Any:
 def project_there(
     box: Box, voxels: Any, views: FloatArray, shape: tuple[int, ...]
 ) -> Any:
-    """Project a volume on the device to images that stay there; does not wait for the kernels.
+    """Project a volume on the device to images (n, rows, cols) there, without waiting.
 
-    `box`: the layout's voxels; `voxels`: of the layout, on the device; `views`: (n, 12) rays in
-    voxels; `shape`: (rows, cols). Returns (n, rows, cols) on the device."""
+    `views`: (n, 12) rays in voxels.
+    """
     from numba import cuda
 
     images = cuda.device_array(len(views) * shape[0] * shape[1], np.float32)
@@ -321,11 +316,7 @@ def project_there(
 def project(box: Box, voxels: Any, views: FloatArray, out: Float32Array) -> None:
     """Fill out (n, rows, cols) with line integrals, in portions of views.
 
-    Args:
-        box: the volume; its flat array is not touched.
-        voxels: the same array as `upload` returned it.
-        views: (n, 12) source, first pixel minus source, u, v in voxel units.
-        out: C-ordered float32.
+    `voxels`: uploaded.
     """
     for part in _chunks(out):
         project_there(box, voxels, views[part], out.shape[1:]).copy_to_host(out[part])
@@ -377,12 +368,10 @@ def spread(
     clean: bool = False,
     deterministic: bool = False,
 ) -> None:
-    """Apply `spread_there` to box.flat on the host: the voxels are moved to the device and the
-    sums back.
+    """Apply `spread_there` to box.flat on the host, moved to the device and back.
 
-    `box`: the volume. `views`: as in `project`. `values`: (n, rows, cols) on the host. `clean`:
-    True if box.flat holds zeros, which are not transferred. `deterministic`: add integers; see
-    `spread_there`."""
+    `clean`: box.flat holds zeros, not transferred; `deterministic`: add integers.
+    """
     if clean:
         voxels = zeros(box.flat.size)
     else:
@@ -392,12 +381,10 @@ def spread(
 
 
 def whole_factor(box: Box, values: Any) -> float:
-    """Compute the power of 2 that scales values for a sum of 64-bit integers.
+    """Compute the power of 2 that scales images for a sum of 64-bit integers below 2^62.
 
-    A ray adds at most its value times a voxel's diagonal; the sum of all rays stays below 2^62.
-    1 for values that are all zero or not finite.
-
-    `box`: sizes of the voxels; `values`: images, on the host or the device (copied to the host).
+    A ray adds its value times a voxel's diagonal at most. 1 for values all zero or not
+    finite.
     """
     diagonal = math.hypot(box.size_x, box.size_y, box.size_z)
     if is_there(values):
@@ -413,10 +400,9 @@ def by_slabs(
 ) -> npt.NDArray[np.bool_]:
     """Find the views that the slab walk can project, (n,) bool.
 
-    All rays of such a view cross the box from side to side between source and pixel, and
-    rise at most one voxel for each that they pass along the faster one of x and y. These
-    are convex conditions: if the detector's corners meet them, all pixels do. A view that
-    fails may still have only such rays."""
+    All rays must cross the box from side to side, rising at most one voxel for each along
+    x or y.
+    """
     return clear_of(box, views, shape) & (rises(views, shape) <= 1.0)
 
 

@@ -332,9 +332,10 @@ class Operator:
         return TorchOperator(self.geometry, self.like, self.detector_shape)
 
     def odl(self) -> Any:
-        """Return the map as an `odl.Operator`, from a discretized function space in mm (z, y,
-        x). Needs the extra `odl`. Both spaces have the weight 1, so that ODL's adjoint is the
-        transpose. Raises TwinError: ODL is not installed."""
+        """Return the map as an `odl.Operator`, from functions in mm (z, y, x).
+
+        Both spaces have the weight 1. Raises TwinError: ODL is not installed.
+        """
         _require("odl", "pip install 'flexdt[odl]'")
         from flexdt.twin.projection.for_odl_and_cil import odl_operator
 
@@ -378,11 +379,11 @@ class Adjoint:
         return f"{self.T!r}.T"
 
     def __matmul__(self, y: Any) -> Any:
-        """Apply the transpose to projections (n, rows, cols); returns voxels (nz, ny, nx).
+        """Apply the transpose to projections (n, rows, cols); returns voxels (nz, ny,
+        nx).
 
-        An array on a CUDA device (but no tensor) gives a `DeviceVolume`; a tensor a tensor, with
-        gradients; any other array one of its own library.
-        Raises GeometryError: another shape than the operator's images.
+        Arrays on CUDA give a `DeviceVolume`, tensors a tensor with gradients. Raises
+        GeometryError: another shape.
         """
         if not _is_tensor(y) and gpu.is_there(y):
             _check(tuple(y.shape), self.T.image_shape, "projections")

@@ -95,10 +95,10 @@ Shape2 = tuple[int, int]
 
 
 def in_order(geometry: ConeVec, order: Order) -> ConeVec:
-    """Return the geometry with its axes permuted as `Volume.in_order` does; the images are the
-    same. (x, y, z) gives the geometry itself.
+    """Return the geometry with axes permuted as by `Volume.in_order`.
 
-    `geometry`: n views; `order`: the old axis in the place of x, y and z."""
+    `order` has the old axes in the place of x, y and z.
+    """
     if order == ORDERS[0]:
         return geometry
     rows = geometry.rows.reshape(-1, 4, 3)[:, :, list(order)].reshape(-1, 12)

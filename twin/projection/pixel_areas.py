@@ -182,12 +182,10 @@ def rays_needed(
     need: Need,
     weight: float = 1.0,
 ) -> Marks:
-    """Find the rays that every pixel needs.
+    """Find the rays that every pixel needs, as marks (n, rows, cols), see `rays_of`.
 
-    `body`: solids, a mesh or voxels; `cone_vec`: ConeVec or (n, 12) [mm], in the body's frame;
-    `shape`: detector (rows, cols); `need`: permitted error; `weight`: attenuation of a unit of
-    the body's projection: 1 for solids and voxels, 1/mm for a mesh.
-    Returns marks, uint8 (n, rows, cols), see `rays_of`; 1 where one ray has the mean.
+    `need`: permitted error; `weight`: attenuation of a unit of the body's projection: 1
+    for solids and voxels, 1/mm for a mesh. 1: one ray has the mean.
     """
     geometry = as_cone_vec(cone_vec)
     marks = np.ones((len(geometry), *shape), np.uint8)

@@ -63,9 +63,10 @@ def portions(job_ns: FloatArray, threads: int) -> Iterator[tuple[int, int]]:
 def turn_portions(
     turns: IntArray, unit_ns: FloatArray, threads: int
 ) -> Iterator[IntArray]:
-    """Yield the rows of `fan_plan.Turns.turns` in portions, each (k, 2). `turns`: (k, 2)
-    consecutive ranges of units; a range may be cut between its units. `unit_ns`: estimated time
-    of each unit [ns]. `threads`: number of threads that share the work."""
+    """Yield `fan_plan.Turns.turns` (k, 2) in portions, ranges cut between units.
+
+    Each takes `unit_ns`.
+    """
     for first, last in portions(unit_ns, threads):
         inside = np.clip(turns, first, last)
         yield inside[inside[:, 0] < inside[:, 1]]
@@ -83,12 +84,11 @@ def fan_job_ns(
     counts: tuple[int, int, int],
     pixels: tuple[int, int],
 ) -> FloatArray:
-    """Estimate the times of the jobs of a plan on one thread [ns], (k,).
+    """Estimate the times of k jobs on one thread [ns], (k,).
 
-    Rays of a source inside the box are counted as walked one by one.
-    `lines`: (m, 2) fan boundaries c = a + b r; `jobs`: (k, 3) view, first line, last line;
-    `views`: (n, 12) source, first pixel minus source, u, v in voxel units; `counts`: voxels of
-    the box; `pixels`: rows of the image, and columns of the widest job.
+    Rays of a source inside the box are walked one by one. `lines`: (m, 2) fan boundaries;
+    `jobs`: (k, 3) view, first, last line; `views`: (n, 12) rays in voxels; `pixels`:
+    rows, and columns of the widest job.
     """
     nx, ny, nz = counts
     level = LEVEL_NS[int(bool(lines[:, 1].any()))]

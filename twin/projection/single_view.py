@@ -86,15 +86,10 @@ class SingleViews:
         self.spare: list[ViewMemory] = []
 
     def project(self, row: FloatArray, image: Float32Array) -> bool:
-        """Fill an image with line integrals.
+        """Fill an image (rows, cols) with line integrals of a view, row (12,) [mm].
 
-        Args:
-            row: (12,) source, detector's center, u and v [mm].
-            image: (rows, cols) filled.
-
-        Returns whether it is filled; False where `gpu` has to project the view. Without the
-        driver's package or a part of it, `usable` becomes False.
-        Raises RuntimeError: the driver failed.
+        Returns False where `gpu` has to project; without the driver's package `usable`
+        becomes False. Raises RuntimeError: the driver failed.
         """
         try:
             memory = self._memory((image.shape[0], image.shape[1]))
@@ -323,13 +318,10 @@ def _array(array: Any) -> list[ctypes.c_int64]:
 
 
 def project(volume: Volume, box: Box, row: FloatArray, image: Float32Array) -> bool:
-    """Fill an image with line integrals of a volume that is on the device.
+    """Fill an image (rows, cols) with line integrals of a volume on the device.
 
-    What is prepared for single views is kept with the volume's copy.
-    `volume`: whose layout has a copy on the device; `box`: of its layout; `row`: (12,) source,
-    detector's center, u and v [mm]; `image`: (rows, cols) filled.
-    Returns whether it is filled; False where `gpu` has to project the view, or the device
-    failed.
+    `row`: (12,) of cone_vec [mm]. Returns False where `gpu` has to project the view, or
+    it failed.
     """
     copy = volume.layout.device_copy
     if copy.single_views is None:

@@ -709,9 +709,9 @@ class Volume:
 
     @property
     def sigma(self) -> Float32Array | None:
-        """Standard deviation of the noise in each voxel, (nz, ny, nx) [1/mm], by the
-        images (`reconstruct`); None if it was not estimated. Computed at each access; of
-        iterations, which take as long as two volumes, at the first.
+        """Noise's standard deviation in each voxel, (nz, ny, nx) [1/mm]; None if unknown.
+
+        Computed at each access, but of iterations once (as long as two volumes).
         """
         noise: Any = getattr(self, "_noise", None)  # of `volume_errors.with_errors`
         values: Float32Array | None
@@ -723,11 +723,9 @@ class Volume:
 
     @property
     def bias_bound(self) -> Float32Array | None:
-        """Bound of each voxel's deviation without noise, (nz, ny, nx) [1/mm]
-        (`reconstruct`).
+        """Bound of each voxel's deviation without noise, (nz, ny, nx) [1/mm].
 
-        NaN where no data cover a voxel; None if it was not estimated. Computed at each
-        access. Where `accuracy.cut_off` it is an estimate.
+        NaN without data, None if not estimated; no bound if `accuracy.cut_off`.
         """
         bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
         bound: Float32Array | None

@@ -162,12 +162,11 @@ class Polychromatic:
         return cls(mu, beam, energy_keV)
 
     def amounts(self, values: Float32Array) -> Iterator[Float32Array]:
-        """Yield each material's density in voxels, relative to the named material's, in the
-        order of `mu`.
+        """Yield each material's relative density in voxels [1/mm], in the order of `mu`.
 
-        A voxel is of the one material whose attenuation is nearest by ratio; negative values are
-        of the one that attenuates least. `values`: (...) [1/mm]. Yields (...), 0 in voxels of
-        other materials."""
+        A voxel is of the material with the nearest attenuation by ratio; negative ones of
+        the least.
+        """
         order = np.argsort(self.mu)
         of = order[
             np.searchsorted(np.sqrt(self.mu[order][1:] * self.mu[order][:-1]), values)

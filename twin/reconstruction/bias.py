@@ -264,12 +264,7 @@ def _within(share: float, shift: FloatArray, spread: FloatArray) -> float:
 
 
 def too_coarse(grid: Grid | Volume, nodes: Volume) -> bool:
-    """Return whether a grid's voxels are too large to hold a uniform region.
-
-    Args:
-        grid: of a volume.
-        nodes: the coarse grid.
-    """
+    """Return whether a grid's voxels are too large to hold a uniform region."""
     return bool(np.max(grid.voxel_mm) > MAX_VOXEL_NODES * max(nodes.voxel_xyz))
 
 
@@ -319,11 +314,8 @@ class BiasOnDemand:
         sides_known: bool = False,
         known: KnownBeam = UNKNOWN_BEAM,
     ) -> BiasOnDemand | None:
-        """Look at copies of a scan; None where a coarse copy cannot be reconstructed (any
-        GeometryError), as of a steep helix or of neither a circle nor a helix.
-
-        `copied`: that have taken all images they want; None where they cannot be made.
-        `sides_known` and `known`: see the class.
+        """Look at copies that have their images; None where a coarse one cannot be
+        reconstructed.
         """
         if copied is None:
             return None
@@ -339,16 +331,14 @@ class BiasOnDemand:
 
     @cached_property
     def bias(self) -> Bias:
-        """The errors, cause by cause.
+        """The errors, cause by cause; unbounded if another geometry fits the images
+        better.
 
-        If the images fit another geometry better, nothing is bounded. The coarse volume's
-        change by each flaw, extrapolated (`extrapolated`), is the standard deviation of its
-        error: missing angles, the rungs of `ladder`, and pixels that stand for what is
-        between them ("sampling"). Another continuation of truncated rows ("beyond"), or for
-        complete rows their level beside the object ("drift"), errors that the images tell and
-        a known spectrum ("hardening") shift values. Standard errors of those, and of what the
-        images leave open, scatter them together ("geometry"); but what may change the volume
-        by more than all that is taken as stated, and named.
+        Standard deviations are the coarse volume's changes by each flaw, extrapolated:
+        missing angles, the rungs of `ladder`, "sampling" between pixels. Truncated rows'
+        other continuation ("beyond"), complete rows' level ("drift"), told errors and a
+        known spectrum ("hardening") shift values; what the images leave open scatters
+        them ("geometry"), but what may exceed all that is taken as stated, and named.
         """
         bounded = self._told
         if bounded.contradiction is not None:
@@ -412,8 +402,8 @@ class BiasOnDemand:
         return accuracy is not None and accuracy.most > WARNING_BOUND
 
     def residuals(self, volume: Volume) -> Residuals | None:
-        """Compare the finer copy's images with the projections of a volume of the scan;
-        None where neither that nor a coarse one can be projected.
+        """Compare the finer copy's images with a volume's projections; None if
+        impossible.
         """
         try:
             return residuals_of(volume, self._measured(FINE_NODES))
@@ -565,9 +555,8 @@ class BiasOnDemand:
     def _changed(self, one: Finding, size: float) -> Float32Array:
         """Compute the change of the coarse volume by an error of a size, (nz, ny, nx).
 
-        Where FDK cannot use the views so corrected, as of a short scan that loses more, the
-        change is that of a part of the error, or of the opposite one, in proportion; where it
-        can use none of these, the whole volume.
+        Where FDK refuses, it is in proportion to a part or the opposite; else the whole
+        volume.
         """
         for part in PARTS_OF_ERRORS:
             try:
@@ -662,12 +651,10 @@ def bias_of(
     *,
     sides_known: bool = False,
 ) -> Bias | None:
-    """Find the possible errors of FDK's volume of a scan at once.
+    """Find the possible errors of FDK's volume of a scan at once; each view is read once.
 
-    `image`: gives the line integrals of a view, (rows, cols), by its number; read once.
-    `cone_vec`: of all views. `shape`: (rows, cols). `truncation`: of `truncation_of`.
-    `sides_known`: beads have told the direction of rotation and mirrored images.
-    Returns None where a coarse scan cannot be reconstructed; see `BiasOnDemand.of`.
+    `image`: gives line integrals (rows, cols) by number. `sides_known`: beads have told
+    rotation and mirroring. Returns None where a coarse scan cannot be reconstructed.
     """
     copies = copies_of(cone_vec, shape, truncation)
     if copies is None:
@@ -684,10 +671,7 @@ def bias_of(
 def copies_of(
     cone_vec: ConeVec, shape: tuple[int, int], truncation: Truncation | None = None
 ) -> ScanCopies | None:
-    """Make copies of a scan, which take its images; None where it cannot be copied.
-
-    `cone_vec`: of all views; `shape`: (rows, cols); `truncation`: of `truncation_of`.
-    """
+    """Make copies of a scan, which take its images; None where it cannot be copied."""
     try:
         copies = ScanCopies(cone_vec, shape)
     except GeometryError:
@@ -839,16 +823,7 @@ def _drift(images: Float32Array) -> Float32Array:
 
 
 def _about(values: Float32Array, weights: FloatArray) -> FloatArray:
-    """Compute the weighted root mean square about each node (Gaussian, 1 node) of the
-    smoothed values; differences have zeros in places.
-
-    Args:
-        values: (nz, ny, nx).
-        weights: (nz, ny, nx), above 0.
-
-    Returns:
-        (nz, ny, nx).
-    """
+    """Compute the weighted rms about each node of smoothed values (nz, ny, nx)."""
     squares = np.square(_smooth_about(values, weights))
     return np.sqrt(np.maximum(_smooth_about(squares, weights), 0.0))
 
@@ -856,17 +831,7 @@ def _about(values: Float32Array, weights: FloatArray) -> FloatArray:
 def scatter_about(
     values: Float32Array, weights: FloatArray, nodes: float = 1.0
 ) -> FloatArray:
-    """Compute the weighted root mean square about each node (Gaussian, 1 node) of the values
-    of regions (`REGION_SIGMA`), which may scatter from node to node.
-
-    Args:
-        values: (nz, ny, nx).
-        weights: (nz, ny, nx), above 0.
-        nodes: radius of a region.
-
-    Returns:
-        (nz, ny, nx).
-    """
+    """Compute the weighted rms about each node of regions' means, `nodes` in radius."""
     squares = np.square(_smooth_about(values, weights, REGION_SIGMA * nodes))
     return np.sqrt(np.maximum(_smooth_about(squares, weights), 0.0))
 

@@ -136,22 +136,9 @@ class CoarseScan:
         truncation: Truncation | None,
         nodes: int = NODES,
     ) -> CoarseScan:
-        """Reduce a scan to at most `VIEWS` views and about `nodes` columns and rows, by
-        choosing views and averaging pixels; images of repeated angles are averaged.
+        """Reduce a scan to `VIEWS` views, about `nodes` columns and rows.
 
-        A panel on its side is turned; a helix gets its outermost rows twice. Columns stay
-        fine enough for `MIN_AXIS_COLUMNS` beyond the axis. Rows and columns that fill no
-        coarse pixel are left out.
-
-        Args:
-            image: gives an image by its number, (rows, cols).
-            cone_vec: of all views.
-            shape: (rows, cols).
-            truncation: of the scan; None if the object is not cut off.
-            nodes: columns, rows and voxels along the longest side.
-
-        Raises:
-            GeometryError: neither a circle nor a helix, or a panel that lies flat.
+        GeometryError: no circle or helix, or a flat panel.
         """
         copy = CoarseCopy(cone_vec, shape, nodes)
         for number in copy.wanted:
@@ -420,14 +407,10 @@ class CoarseScan:
         cone_vec: ConeVec,
         truncation: Truncation | None = None,
     ) -> Float32Array:
-        """Reconstruct the grid by FDK on the processor; voxels that only continued rows show are
-        kept.
+        """Reconstruct the grid by FDK on the processor; voxels that only continued rows
+        show stay.
 
-        The images are not changed.
-
-        `images`: (n, rows, cols) line integrals; `cone_vec`: n views; `truncation`: continues
-        the images beyond the panel.
-        Returns (nz, ny, nx) [1/mm], NaN where no data cover it.
+        `images`: (n, rows, cols) line integrals, unchanged. Returns [1/mm], NaN unseen.
         Raises GeometryError: FDK cannot use the views.
         """
         shape = (images.shape[1], images.shape[2])
@@ -443,17 +426,11 @@ class CoarseScan:
         return volume.data
 
     def seen(self, thing: Float32Array, rung: Rung) -> Float32Array:
-        """Project values on the grid in a rung's geometry and reconstruct them by FDK.
+        """Project values (nz, ny, nx) in a rung's geometry and reconstruct them; 0
+        unseen.
 
-        A shifted panel's hidden part (`truncation.beyond`) is weighed as in the scan, but
-        not in parallel views without a flaw; rows are never continued.
-
-        Args:
-            thing: (nz, ny, nx).
-            rung: geometry.
-
-        Returns:
-            (nz, ny, nx), 0 where unseen.
+        A shifted panel's hidden part is weighed as in the scan, but not in parallel views
+        without a flaw; rows are never continued.
         """
         if rung.layers is not None:
             return self._layer_by_layer(thing, rung, rung.layers)
@@ -500,12 +477,10 @@ class CoarseScan:
         fine: bool = True,
         beyond: bool = True,
     ) -> Float32Array:
-        """Project values on the grid as some views see them.
+        """Project values (nz, ny, nx) as views see them, (n, rows, cols).
 
-        `thing`: the values, (nz, ny, nx); `views`: n of them; `shape`: (rows, cols); `fine`:
-        average two rays a column: the steps of voxels would show as a flaw of their own;
-        `beyond`: the outermost layers are repeated above and below (`more`).
-        Returns (n, rows, cols) line integrals.
+        `fine` averages two rays a column: the steps of voxels would show as a flaw.
+        `beyond` repeats the outermost layers above and below (`more`).
         """
         if self.more and beyond:
             thing = np.pad(thing, ((self.more, self.more), (0, 0), (0, 0)), "edge")
@@ -770,10 +745,8 @@ class ScanCopies:
             copy.take(number, image)
 
     def passing(self, parts: Iterable[Float32Array]) -> Iterator[Float32Array]:
-        """Yield all images of the scan in parts, unchanged, and take them on the way.
-
-        Args:
-            parts: (k, rows, cols) each, in the order of the views.
+        """Yield all images in parts (k, rows, cols), unchanged, and take them on the
+        way.
         """
         number = 0
         for part in parts:
@@ -791,19 +764,9 @@ class ScanCopies:
 
 
 def _every(cone_vec: ConeVec, each: int, circle: Circle) -> npt.NDArray[np.intp]:
-    """Choose every so many-th view, or views that are closer, so that they leave arcs out
-    ("gaps") if and only if the scan does.
+    """Choose every `each`-th view, or closer: with gaps if and only if the scan has.
 
-    Of views at random angles some have a gap that all have not. FDK weighs the rays of a
-    panel aside otherwise with gaps: the copy of a right scan did not fit its images.
-
-    Args:
-        cone_vec: n views in order of angle.
-        each: largest step.
-        circle: of the scan.
-
-    Returns:
-        (k,) numbers of views; all if no step is right.
+    With gaps FDK weighs rays otherwise: copies of right scans would not fit.
     """
     for step in range(each, 1, -1):
         chosen = np.arange(0, len(cone_vec), step)

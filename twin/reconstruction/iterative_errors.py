@@ -161,13 +161,8 @@ def on_copies(
 ) -> OnCopy:
     """Make an algorithm that does to coarse copies of a scan what made its volume.
 
-    A penalty counts the faces of voxels, of which coarse ones have fewer in the same volume:
-    its weight is that of the same attenuation and size of an object.
-
-    Args:
-        algorithm: called with images, views and grid.
-        options: of the volume; those with arrays of its own are left out.
-        made: the volume.
+    A penalty counts voxels' faces: its weight becomes that of the same object. Of
+    `options`, arrays are left out.
     """
     smaller = {name: one for name, one in options.items() if name in OF_COPIES}
 

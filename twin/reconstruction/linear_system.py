@@ -228,15 +228,10 @@ class LinearSystem:
         return room_like(self.like)
 
     def scales(self, views: Some) -> tuple[Float32Array, Float32Array]:
-        """Compute factors of the residuals of some views, and of their back-projection.
+        """Compute factors of residuals (n, rows, cols), and of their back-projection.
 
-        Without weights they are inverse sums of the projector's rows and columns. With
-        weights those, and one over the curvature of a paraboloid above the weighted
-        squares, which no step overshoots (Erdogan and Fessler 1999). Zero where the sum
-        is (nearly) zero.
-
-        Returns:
-            (n, rows, cols) and (nz, ny, nx).
+        Inverse sums of rows and columns; or the weights, and one over a curvature that no
+        step overshoots (Erdogan and Fessler 1999).
         """
         rows = self.project(ones(self.first(None)), views)
         if self.weights is None:
@@ -385,10 +380,10 @@ class RegionSystem(LinearSystem):
         )
 
     def first(self, start: Volume | None) -> Float32Array:
-        """Return start values of region and surroundings as one flat vector: `start` or zeros in
-        the region, zeros around it.
+        """Return start values of region (`start` or 0) and surroundings (0), flat.
 
-        Raises GeometryError: `start` is on another grid than the region's."""
+        Raises GeometryError: another grid.
+        """
         x = np.zeros(math.prod(self.like.shape) + self.outside.size, np.float32)
         if start is not None:
             self.grids(x)[0][...] = super().first(start)

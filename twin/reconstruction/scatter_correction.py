@@ -123,16 +123,9 @@ def without_scatter(
 
 
 def subtracted(line_integrals: Float32Array, scatter: Float32Array) -> Float32Array:
-    """Subtract scatter from line integrals.
+    """Subtract scatter, in units of the open beam, from line integrals (rows, cols).
 
-    Args:
-        line_integrals: (rows, cols) of the signal over the open beam's; above `BLACK`
-            they count as that.
-        scatter: (rows, cols), in units of the open beam; at most `MOST` of the signal is
-            subtracted.
-
-    Returns:
-        New line integrals (rows, cols), larger by the scatter's share.
+    These count up to `BLACK`; scatter up to `MOST` of the signal.
     """
     over = np.exp(np.minimum(line_integrals, np.float32(BLACK)))
     part = np.minimum(scatter * over, np.float32(MOST))

@@ -310,11 +310,8 @@ class _At:
     cost: float = math.nan
 
     def beyond(self, last: _At, part: float) -> _At:
-        """Extrapolate from `last` through this point by `part` of their distance;
-        residuals too, so that nothing is projected.
-
-        Returns:
-            A new point of unknown cost; this point itself for 0.
+        """Extrapolate from `last` through this point, residuals too, without
+        projecting.
         """
         if part == 0.0:
             return self
@@ -342,13 +339,7 @@ class _Objective:
         return _At(x, rest, cost)
 
     def step(self, at: _At, step: float) -> Any:
-        """Take a step down the gradient of the squares, then the proximal map of the
-        rest; returns a new volume.
-
-        Args:
-            at: point from which the step begins.
-            step: length of the step.
-        """
+        """Step down the squares' gradient; then the proximal map of the rest."""
         z = at.x - np.float32(step) * self.problem.spread(at.rest)
         return self.regular.proximal(z, step * self.strength)
 
@@ -452,11 +443,9 @@ class Regular:
         return x
 
     def primal_step(self, z: Any, dual: Any, theta: np.float32, x: Any) -> None:
-        """Fill x from the dual variables, by portions of layers; see
-        `tv_kernels.primal_step`.
+        """Fill x (nz, ny, nx) from the dual variables (3, nz, ny, nx), by layers.
 
-        `z`: voxels (nz, ny, nx); `dual`: (3, nz, ny, nx); `theta`: weight of total
-        variation; `x`: (nz, ny, nx), changed.
+        `theta`: the weight of total variation.
         """
         from flexdt.twin.reconstruction.kernels import tv_kernels
 

@@ -45,14 +45,12 @@ class UniformNodes:
 
     @classmethod
     def of(cls, values: Float32Array, rim: npt.NDArray[np.bool_]) -> UniformNodes:
-        """Find the uniform nodes of a volume.
+        """Find the uniform nodes of a volume [1/mm], NaN unseen.
 
-        Edges are changes of `EDGE_CHANGE_SHARE` of the body's attenuation (`_typical`). Nodes of
-        the object are seen by all views and have at least `MIN_NEIGHBOURHOOD_SHARE` of the
-        smooth value and `MIN_BODY_SHARE` of the body's. Nodes that some view does not see have
-        hardly any weight (1e-3).
-        `values`: (nz, ny, nx) [1/mm], NaN where no data cover a node. `rim`: voxel columns
-        outside some views, (ny, nx); they count as 0.
+        Edges change by `EDGE_CHANGE_SHARE` of the body. Nodes of the object are seen by
+        all views and have `MIN_NEIGHBOURHOOD_SHARE` of the smooth value, `MIN_BODY_SHARE`
+        of the body's, at least. Others have a weight of 1e-3. `rim`: columns (ny, nx)
+        outside some views; they count as 0.
         """
         unseen = np.isnan(values) | rim
         sharp = np.where(rim, np.float32(0.0), np.nan_to_num(values))
@@ -71,10 +69,9 @@ class UniformNodes:
         return away if away.any() else self.inside
 
     def change(self, other: Float32Array) -> float:
-        """Compute the largest relative change of nine of ten uniform nodes; 0 without such
-        nodes.
-
-        `other`: smooth values of another volume, (nz, ny, nx) [1/mm]."""
+        """Compute the largest relative change of nine of ten uniform nodes; 0 without
+        any.
+        """
         if not self.uniform.any():
             return 0.0
         ratios = other[self.uniform] / self.found[self.uniform]

@@ -52,10 +52,11 @@ class BoundOf(Protocol):
 def with_errors(
     volume: Volume, noise: SigmaOf | None = None, bias: BoundOf | None = None
 ) -> Volume:
-    """Return a copy of a volume with sources of its `sigma` and `bias_bound`; None leaves that
-    of the volume. The data are shared. Volumes derived from it have none: they are no fields.
-    `volume`: not changed; `noise`: source of `sigma`; `bias`: source of `bias_bound` and
-    `accuracy`."""
+    """Return a copy of a volume (data shared) with sources of its `sigma` and
+    `bias_bound`.
+
+    None leaves that of the volume. Derived volumes have none.
+    """
     found = replace(volume)
     object.__setattr__(found, "_noise", noise or getattr(volume, "_noise", None))
     object.__setattr__(found, "_bias", bias or getattr(volume, "_bias", None))
@@ -93,9 +94,10 @@ def interpolated(nodes: Volume, grid: Volume) -> Float32Array:
 
 
 def _neighbours(places: FloatArray, known: FloatArray) -> Neighbours:
-    """Find the known places next to others, for linear interpolation; places outside count as
-    the outermost. `places`: (n,); `known`: (m,) increasing, one at least. Returns lower and
-    upper index, and the share of the upper one, (n,) each."""
+    """Find known places (m,), increasing, about others (n,), for linear interpolation.
+
+    Returns lower, upper index, the upper's share; outside: the outermost.
+    """
     at = np.interp(places, known, np.arange(len(known)))
     lower = np.minimum(at.astype(np.int64), max(len(known) - 2, 0))
     upper = np.minimum(lower + 1, len(known) - 1)

@@ -186,15 +186,11 @@ class Lookahead:
     def touching(
         self, *, deep: bool = False, standing: bool = False
     ) -> Mapping[tuple[str, str], float]:
-        """Find the pairs within the safety margin now, as `Guard.touching`.
+        """Find the pairs within the safety margin now, -> clearance [mm]; as
+        `Guard.touching`.
 
-        Overlaps are 0 unless `deep`.
-
-        Args:
-            deep: measure overlaps.
-            standing: of parts at their present places, as `Guard.standing` has them.
-
-        Returns pair -> clearance [mm]; empty without a guard.
+        Overlaps are 0 unless `deep`; `standing` is of parts at their present places.
+        Empty without a guard.
         """
         here = {
             name: d.at(self.now).position(self.now) for name, d in self.drives.items()
@@ -213,19 +209,13 @@ class Lookahead:
     def joined(self, new: Trajectories) -> Joined:
         """Find the first certified programme for a requested motion; nothing moves yet.
 
-        A request without contact is taken as it is. Else it is the first of these that is free
-        and either takes some motor `MIN_STEP` farther or halts one that is under way: 1. No
-        other motor is under way: a single new motor goes to its last free position, and
-        otherwise the new motors halt along their path before the contact. 2. Others are under
-        way: the new motors halt before the contact, the others carry on. 3. Others and at least
-        one of the new motors are under way: all halt along the new path. None of them is tried
-        where the last free moment is not after now.
-
-        Args:
-            new: motor -> requested trajectory.
-
-        Returns trajectories of the programme, empty if there is none, and the contact of the
-        request, or None.
+        A request without contact is taken as it is. Else the first that is free and takes
+        some motor `MIN_STEP` farther or halts one: 1. No other motor is under way: a
+        single new one goes to its last free position, several halt along their path. 2.
+        Others are: the new ones halt before the contact, others carry on. 3. One of the
+        new ones is, too: all halt along the new path. Without a later free moment none is
+        tried.
+        Returns trajectories, empty without one, and the contact of the request.
         """
         contact = self.contact(new)
         if contact is None:
@@ -340,20 +330,11 @@ class Lookahead:
     def _latest(
         self, holds: Callable[[float], bool], contact: Contact, halvings: int
     ) -> float | None:
-        """Find a late moment before the contact for which `holds`.
+        """Find a late moment [s] before the contact for which `holds`, perhaps not the
+        latest.
 
-        Not necessarily the latest: steps begin at `FIRST_LEAD_S`, and never go before
-        now.
-
-        Steps back from the contact double until it holds, then bisection.
-
-        Args:
-            holds: the condition on a moment [s].
-            contact: the contact.
-            halvings: number of steps of the bisection.
-
-        Returns:
-            The moment [s]; None if the condition does not hold even now.
+        Steps back from it double from `FIRST_LEAD_S`, never before now, until it holds;
+        then bisection. None if it does not hold even now.
         """
         late = contact.last_free_time
         back = FIRST_LEAD_S
@@ -377,13 +358,10 @@ class Lookahead:
     # -----------------------------------------------------------------------------------
 
     def stopped(self, most: Most = None) -> StopMotion:
-        """Compute how everything stops: along the path, or quicker where a sweep shows
-        that free.
+        """Compute how everything stops: along the path, or quicker "apart" where that is
+        free.
 
-        An error of the sweep gives the stop along the path. Nothing moves yet.
-
-        `most`: motor -> greatest acceleration; None: the planned ones. Returns the stop,
-        its path "apart" where it is the quicker one, else "along".
+        Nothing moves yet. `most`: motor -> greatest acceleration; None: planned ones.
         """
         along = braked_along(self.drives, self.now, most)
         try:
@@ -456,11 +434,9 @@ class Lookahead:
         return sum(len(d.trajectories) for d in self.drives.values() if d.end > self.now)
 
     def halted_at_once(self, contact: Contact) -> Trajectories | None:
-        """Slow what is under way along its path from now on, with the hardest accelerations.
+        """Slow what is under way along its path with the hardest accelerations, unswept.
 
-        Nothing is swept: the path is free up to the contact.
-        `contact`: ahead on it.
-        Returns motor -> trajectory; None if it rests later than the contact's last free moment.
+        None if it rests later than the contact's last free moment.
         """
         if (
             programme_time_at_rest(self.drives, self.now, self.hardest)
@@ -470,16 +446,13 @@ class Lookahead:
         return braked_along(self.drives, self.now, self.hardest)
 
     def halted(self, under_way: Trajectories, contact: Contact) -> Trajectories | None:
-        """Find a halt of what is under way before a contact that a new stage has put ahead of
-        it.
+        """Find a halt of what is under way before a contact that a new stage has put
+        ahead.
 
-        The first of these that is free: a single motor goes to its last free position; all brake
-        as late as possible along the path, which is free up to the contact; all brake at once
-        along the path; each motor brakes at once by itself. The last two brake as hard as the
-        machine can, are swept, and must rest within travel.
-
-        `under_way`: motor -> present trajectory; `contact`: ahead on them.
-        Returns motor -> trajectory; None if no halt is free.
+        The first that is free: a single motor goes to its last free position; all brake
+        as late as possible along the path; all at once along it; each by itself. The last
+        two brake as hard as the machine can, are swept, and rest within travel. Returns
+        None if no halt is free.
         """
         halted = self._halt_alone(under_way, contact) or self._halt_along(
             under_way, contact
@@ -497,10 +470,10 @@ class Lookahead:
         return None
 
     def _within_travel(self, trajectories: Trajectories) -> bool:
-        """Return whether all motors rest within their travel, to `POSITION_ROUNDING`.
+        """Return whether all motors rest within their travel.
 
-        A motor that stops in step with a weaker one goes farther than its own programme did.
-        `trajectories`: motor -> trajectory; only its target is checked."""
+        In step with a weaker one they go farther.
+        """
         return all(
             distance_beyond(self.machine, name, t.target) <= POSITION_ROUNDING
             for name, t in trajectories.items()
@@ -605,17 +578,15 @@ class StageChange:
         return replace(self, found=self.verdict())
 
     def renewed(self, before: StageChange) -> Joined:
-        """Judge the change at the takeover, reusing the verdict found `before` where possible.
+        """Judge the change at the takeover, reusing the verdict found `before` where
+        possible.
 
-        1. Stage, stops and programmes are the same, nothing is to be moved, and the motion was
-        free: it still is. 2. At most `MAX_SWEPT_LEGS` trajectories are under way: the change is
-        judged anew. 3. A longer programme is the same as before and must halt: it halts at once,
-        if it rests before the contact that was found.
-        `before`: the same change, as it was prepared and swept.
-        Returns the halting motion and its contact; no trajectories and None where motion carries
-        on.
-        Raises CollisionError: as `verdict`; SafetyError: none of the three applies (a long
-        programme has begun or gone on meanwhile); nothing changes.
+        1. Stage, stops and programmes are the same, nothing moves by it, and the motion
+        was free: it still is. 2. At most `MAX_SWEPT_LEGS` trajectories are under way: it
+        is judged anew. 3. A longer programme that must halt does at once, if it rests
+        before the contact found. Returns halting motion and contact, or none.
+        Raises CollisionError: as `verdict`; SafetyError: none of the three applies (a
+        long programme went on meanwhile).
         """
         still = before.version == self.version and not self.moves
         found = before.found
@@ -667,15 +638,12 @@ class StageChange:
         return Joined(halted, contact)
 
     def _require_no_nearer(self, changed: Lookahead) -> None:
-        """Check that the new stage brings no pair within the safety margin that was not, and no
-        near pair below its floor.
+        """Check that the new stage brings no pair within the safety margin, or below its
+        floor.
 
-        A sample on a stage of the turntable is as large as the region that the stage can bring
-        it to. Pairs that are near already are therefore measured at their present positions as
-        well: else that region would excuse a sample that really overlaps. Without a pair within
-        the margin that second measurement is left out.
-
-        `changed`: all motors now, with the guard of the new stage.
+        A sample on a stage of the turntable counts as the region that the stage can
+        reach. Pairs near already are measured at their places as well: else it would
+        excuse a sample that really overlaps.
         Raises CollisionError: names the first such pair.
         """
         margin = self.ahead.machine.safety_margin_mm

@@ -297,17 +297,11 @@ def would_touch(
     outcome: str,
     **data: object,
 ) -> CollisionError:
-    """Make the error for a command after which two parts meet, or are too near; returned,
-    not raised.
+    """Make (do not raise) the error for a command after which two parts meet or are too
+    near.
 
-    Args:
-        what: the command, for people.
-        pair: the two parts.
-        ahead: time until they meet [s]; 0 for parts that are near now.
-        last_free: motor -> last free position [mm, deg].
-        near: words for parts that are near now.
-        outcome: words for the actual outcome.
-        data: further members of the error's data.
+    `ahead`: time until then [s]; 0 where they are `near` now. `last_free`: motor -> [mm,
+    deg]; `outcome`: in words.
     """
     how = near
     if ahead > 0.0:

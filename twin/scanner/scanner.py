@@ -313,18 +313,9 @@ class ScannerTwin:
         relative: bool = False,
         shortest: bool = False,
     ) -> dict[str, float]:
-        """Compute the motor targets that a move would have; nothing moves.
+        """Compute the motor targets [mm, deg] of a `move`; nothing moves.
 
-        Neither the safety state nor contacts are checked.
-
-        Args:
-            targets, now, relative, shortest: as for `move`.
-
-        Returns:
-            Motor -> target [mm, deg], of the motors that would be sent.
-
-        Raises:
-            UnknownNameError, LimitError: as `move`.
+        Safety and contacts are not checked. Raises UnknownNameError, LimitError.
         """
         planned = plan.plan_move(
             self.machine, self._drives, targets, now, relative=relative, shortest=shortest
@@ -334,16 +325,10 @@ class ScannerTwin:
     def limit_messages(
         self, targets: Mapping[str, float], now: float, *, relative: bool = False
     ) -> list[str]:
-        """List messages about targets beyond a limit that would arrive at the limit;
-        nothing moves.
+        """List messages about targets that would end at a limit; nothing moves.
 
-        All end with "set to the limit", also where the machine refuses such targets. The
-        list is empty if all targets are within travel.
-
-        Args:
-            targets: axis -> position [mm, deg].
-            now: twin time [s].
-            relative: targets are displacements from where the motors are bound for.
+        Arguments are those of `move`. All end with "set to the limit", also where the
+        machine refuses such targets.
 
         Raises:
             UnknownNameError: no such axis.
@@ -464,16 +449,8 @@ class ScannerTwin:
     def place(self, positions: Mapping[str, float], now: float) -> None:
         """Set motors to known positions at rest, at once: a start, not a motion.
 
-        The others rest at once where their present motion would have ended. Nothing is
-        swept; parts that touch then block the scanner, which is no error here.
-
-        Args:
-            positions: motor or virtual axis -> position [mm, deg]; others as above.
-            now: twin time [s].
-
-        Raises:
-            UnknownNameError, LimitError: no such axis, or outside its travel; nothing is
-                changed.
+        Others rest where their motion would have ended. Nothing is swept; touching parts
+        block the scanner. Raises UnknownNameError, LimitError: nothing is changed.
         """
         wanted = resolve_targets(self.machine, positions, self.positions(now))
         stand = {**self.targets(now), **wanted}
@@ -756,12 +733,8 @@ class ScannerTwin:
         """Change the tube's settings; those left out stay.
 
         Args:
-            kV, power_W: voltage [kV] and power [W].
-            on: X-rays on or off.
-            now: time of the switch [s]; None is long ago, so that X-rays are ready at
-                once. Used with `on` only.
-            warm: leave out the warm-up after a long rest (scripts are planned without
-                one).
+            now: time of the switch [s]; None: long ago, X-rays are ready.
+            warm: leave out the warm-up after a long rest, as scripts do.
 
         Raises:
             LimitError: outside the tube's range; nothing is changed.
@@ -805,7 +778,7 @@ class ScannerTwin:
     def _set_stage(
         self, sample: Sample, correction: NamedCorrection | None, guard: Guard | None
     ) -> None:
-        """Set sample, correction and guard, and count a change: certificates of before are void."""
+        """Set sample, correction and guard; certificates of before are void."""
         self.sample = sample
         self.correction = correction
         self.guard = guard
@@ -864,10 +837,10 @@ class ScannerTwin:
         return self._judged[1]
 
     def _safety_at(self, now: float) -> Safety:
-        """Return the safety state, with contact judged by where the parts are.
+        """Return the safety state, with contact judged by where parts are.
 
-        Where that cannot be judged it is the contact known before; no motion begins then
-        (`_require_ready`)."""
+        Where that fails it is as known before.
+        """
         try:
             return with_contact(self.safety, self._touching(now))
         except Exception:  # whatever the guard meets, the safety state is told
@@ -883,13 +856,9 @@ class ScannerTwin:
     ) -> CollisionError:
         """Count a blocked attempt, and let the motors follow the motion that is left.
 
-        If that was the attempt too many (the state is blocked, and not by a contact that lasts),
-        all motors stop instead.
-
-        `joined`: the motion that is left, and the contact that cut it short; `now`: time of the
-        command [s]; `what`: the command, for people; `zero`: time at which the clock of the
-        contact shows 0 [s].
-        Returns the error to raise, with where the motors come to rest.
+        If that was once too often (blocked, and by no lasting contact), all motors stop
+        instead. `what`: the command, for people; `zero`: time at which the contact's
+        clock shows 0 [s]. Returns the error to raise, with where motors come to rest.
         """
         contact = joined.contact
         assert contact is not None

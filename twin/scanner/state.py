@@ -122,9 +122,9 @@ class StagePlacement:
         return turned
 
     def to_sample(self, cone_vec: ConeVec) -> ConeVec:
-        """Transform a geometry of the object's frame to the sample's own frame (for the
-        projector). The placement's turn and shift [mm] are undone; without a placement the
-        geometry itself."""
+        """Transform a geometry of the object's frame to the sample's own, by its
+        placement.
+        """
         if self == StagePlacement():
             return cone_vec
         back = self.rotation.T
@@ -176,8 +176,7 @@ class NamedCorrection:
         *,
         sides_known: bool = False,
     ) -> NamedCorrection:
-        """Make the correction with these values [mm, deg], without a panel's distortion. Raises
-        UnknownNameError: a name that is not a parameter."""
+        """Make the correction of values [mm, deg]. Raises UnknownNameError."""
         parameters = Offsets.from_edge(values)
         return cls(name, date, parameters, note, sides_known=sides_known)
 
@@ -252,17 +251,10 @@ class ScannerState:
 def readout(
     poses: Poses, camera: CameraSettings, sensor: PixelGrid, parameters: Offsets = NOMINAL
 ) -> Readout | None:
-    """Compute derived quantities of the first of `poses`.
+    """Compute derived quantities of the first of `poses` with the correction's
+    `parameters`.
 
-    Args:
-        poses: nominal poses, world frame.
-        camera: decides the image's shape.
-        sensor: decides the pixel pitch.
-        parameters: the correction in force.
-
-    Returns:
-        The readout, or None where there is none: the axis or the detector is not in front
-        of the focal spot.
+    None where axis or detector are not in front of the focal spot.
     """
     cone = poses[:1].cone_vec(parameters)
     # The axis in the object's frame: through tau, whose direction tau_y does not matter here.
@@ -326,16 +318,11 @@ class CameraChange(TypedDict, total=False):
 def switched(
     machine: Machine, tube: TubeSettings, on: bool, now: float | None, *, warm: bool
 ) -> TubeSettings:
-    """Switch the tube on or off.
+    """Switch the tube on or off at `now` [s]; None: it is ready already.
 
-    X-rays are ready after the times of switching on and of stabilising, and after the warm-up
-    too if the tube rested longer than the machine's `cold_after_s`.
-
-    `machine`: has these times. `tube`: before; its present state again changes nothing, unless
-    `now` is None. `on`: on or off. `now`: time of the command [s]; None: the X-rays are ready
-    already, and the time of the last switch stays. `warm`: no warm-up, however long the rest
-    was.
-    Returns the tube after it.
+    X-rays are ready after the times of switching on and stabilising, and of the warm-up
+    if the tube rested longer than `cold_after_s`, unless `warm`. Its present state again
+    changes nothing, unless `now` is None.
     """
     if now is None:
         return replace(tube, on=on, ready_at=-math.inf)
@@ -418,12 +405,10 @@ def require_applicable(
     camera: CameraSettings,
     correction: NamedCorrection | None,
 ) -> None:
-    """Check that a correction leaves a geometry that a scanner can have, anywhere in the travel;
-    see `require_before_source`.
+    """Check that a correction leaves a possible geometry, anywhere in the travel.
 
-    `machine` and `profile` and `camera`: as there; `correction`: None checks the nominal
-    geometry.
-    Raises GeometryError: as there."""
+    None checks the nominal one. Raises GeometryError: as `require_before_source`.
+    """
     if correction is None:
         what = "the machine file's travel"
         require_before_source(machine, profile, camera, NOMINAL, what)

@@ -348,10 +348,11 @@ class _Writer(MotorTargets):
         yield from self.drive(name, rotation.speed, rotation.acceleration)
 
     def turn(self, total: float, frames: int, first: int) -> Iterator[str]:
-        """Yield a smooth scan of `frames` images over `total` degrees from angle 0, and its
-        run-up. Run-up before and after. Afterwards speed and acceleration are the axis's own
-        again; images are numbered from `first`. `total`: angle from first to last image [deg];
-        `frames`: number of images; `first`: number in the first image's file name."""
+        """Yield a smooth scan over `total` degrees from angle 0, with its run-up.
+
+        Then speed and acceleration are the axis's own again. `first`: first file's
+        number.
+        """
         name, rotation = self.rotation
         yield from self.run_up(total, frames)
         yield from self.sweep(total, frames, first)
@@ -375,13 +376,10 @@ class _Writer(MotorTargets):
         yield _row("scanner", "write settings file")
 
     def sweep(self, total: float, frames: int, first: int) -> Iterator[str]:
-        """Yield the move from the run-up's start to its end after `total` degrees, and
-        the image sequence that it triggers at angle 0.
+        """Yield the move from the run-up's start to its end after `total` degrees.
 
-        Args:
-            total: angle from first to last image [deg].
-            frames: number of images, which decides speed and run-up.
-            first: number in the first image's file name.
+        It triggers the image sequence at angle 0, numbered from `first`; `frames` decides
+        speed and run-up.
         """
         name = self.rotation[0]
         end = self.turned_to(total + self.run_up_deg(total, frames), total)
@@ -444,12 +442,11 @@ class _Writer(MotorTargets):
     def go(
         self, *quantities: str, place: ScanPosition | None = None, shift: float = 0.0
     ) -> Iterator[str]:
-        """Yield moves of the motors of `quantities` alone to their station.
+        """Yield moves of the motors of `quantities`, such as object_y, alone to their
+        station.
 
-        Other motors are not moved.
-
-        `*quantities`: such as object_y; each has a motor of its own (`driver`), else LimitError.
-        `place`: of the sample; None: the request's SOD. `shift`: of the detector sideways [mm].
+        `place`: None: the request's SOD; `shift`: of the detector sideways [mm]. Raises
+        LimitError.
         """
         if place is None:
             at = ScanPosition(self.request.sod_mm)

@@ -233,14 +233,7 @@ def reply_bytes(text: str) -> bytes:
 
 
 def motor_cluster(motor: MotorReply) -> bytes:
-    """Encode a motor's reply in the scanner's form of `_REPLY_BYTES`; unknown bytes are
-    zero.
-
-    Args:
-        motor: position, target, rates and limits [mm, deg, mm/s, deg/s].
-
-    Returns:
-        The reply's bytes.
+    """Encode a motor's reply in `_REPLY_BYTES`; unknown bytes are zero.
 
     Example:
         >>> axis = MotorReply(90.0, 90.0, 45.0, 45.0, -360.0, 360.0, 200.0, 300.0)

@@ -54,9 +54,7 @@ class ArgumentError(ValueError):
     def __init__(
         self, message: str, code: ScriptCode = ScriptCode.VALUE, index: int = 0
     ) -> None:
-        """Make the error of an argument: message, code of the problem, index of the argument
-        (0 or 1).
-        """
+        """Make the error of the argument at `index` (0 or 1)."""
         super().__init__(message)
         self.code = code
         self.index = index
@@ -118,10 +116,10 @@ def number(text: str, what: str, index: int = 0) -> float:
 
 
 def positive(text: str, what: str) -> float:
-    """Read a number above zero; the least one that may be set is the machine's.
+    """Read a number above zero, of argument `what`.
 
-    `text`: of the argument; `what`: name of the argument, for the message.
-    Raises ArgumentError: another number, or none."""
+    Raises ArgumentError: another number, or none.
+    """
     value = number(text, what)
     if value <= 0.0:
         raise ArgumentError(f"{what} is {shorten(text)}; it must be above 0")
@@ -142,9 +140,7 @@ def not_negative(text: str, what: str) -> float:
 def whole(text: str, what: str, low: int, high: int, index: int = 0) -> int:
     """Read a whole number from `low` to `high`; `1440.000000` is one too.
 
-    `text`: of the argument; `what`: name of the argument, for the message; `low` and `high`:
-    least and greatest value allowed; `index`: place of the argument, 0 or 1.
-    Raises ArgumentError: another number, or none.
+    Raises ArgumentError for argument `what`, at place `index` (0 or 1).
     """
     value = number(text, what, index)
     if not value.is_integer() or not low <= value <= high:
@@ -324,11 +320,10 @@ def vocabulary(component: str) -> tuple[str, ...]:
 
 
 def find(component: str, command: str) -> Spec | None:
-    """Look up the command of `component`, case and blanks aside; motors share one vocabulary.
+    """Look up a component's command, case and blanks aside; None if there is none.
 
-    `component`: first column of a row; an unknown name is taken for a motor. `command`: its
-    name, as in the second column. Returns type, reader and number of arguments of the command;
-    None if there is no such command."""
+    Unknown components are motors, which share one vocabulary.
+    """
     table = _BY_KEY.get(component.lower()) or _BY_KEY[""]
     spec = table.get(command.lower())
     if spec is not None:
@@ -349,11 +344,10 @@ def match(component: str, words: list[str]) -> tuple[Spec, int] | None:
 
 
 def bare_name(path: str) -> str:
-    r"""Return the last part of `path` (after \ or /) as a safe file name; may be empty.
+    r"""Return the last part of `path` as a safe file name; may be empty.
 
-    Characters that some file system does not allow become `_`, blanks and dots at its
-    ends are dropped, it is cut to `MAX_NAME_CHARS`, and a device's name (con, nul, com1
-    ...) gets a `_` before it."""
+    Disallowed characters become `_`; a device's name (con ...) gets one before it.
+    """
     name = re.split(r"[\\/]", path)[-1]
     name = _UNSAFE.sub("_", name).strip(" .")[:MAX_NAME_CHARS]
     if _DEVICE.fullmatch(name):
@@ -362,11 +356,9 @@ def bare_name(path: str) -> str:
 
 
 def image_name(path: str) -> str | None:
-    """Return the file name of one image without its folder; `.tif` is added unless it
-    ends in .tif or .tiff.
+    """Return an image's file name without folder, `.tif` added where missing.
 
-    Unsafe characters are replaced as by `bare_name`. None if the path ends without a
-    name, or the name is only "tif" or "tiff".
+    Made safe by `bare_name`; None without a name.
     """
     name = bare_name(path)
     if not name or name.lower() in ("tif", "tiff"):
@@ -377,10 +369,10 @@ def image_name(path: str) -> str | None:
 
 
 def sequence_names(prefix: str, first: int, count: int) -> tuple[str, ...]:
-    """List `count` file names from number `first`: prefix without folder, six digits, `.tif`.
+    """List `count` file names from number `first`: prefix, six digits, `.tif`.
 
-    A prefix that ends with a slash is only a folder: the names are numbers. Unsafe characters
-    are replaced as by `bare_name`."""
+    A prefix that ends with a slash is only a folder.
+    """
     name = ""
     if not prefix.endswith(("\\", "/")):
         name = bare_name(prefix)
@@ -388,11 +380,7 @@ def sequence_names(prefix: str, first: int, count: int) -> tuple[str, ...]:
 
 
 def kind_of(name: str) -> ImageKind:
-    """Determine an image's kind by its file name: "di" and digits is dark, "io" and
-    digits flat, anything else a projection.
-
-    Case does not matter; one `_` or `-` before the digits and an ending .tif or .tiff are
-    allowed, digits may be missing."""
+    """Return an image's kind by its name: "di" and digits dark, "io" flat."""
     if _DARK.fullmatch(name):
         return "dark"
     if _FLAT.fullmatch(name):

@@ -324,11 +324,10 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
 
 
 def against_log(log: Log, machine: Machine) -> list[LogRow]:
-    """Simulate the commands of an executed script, from the machine's home; return each
-    line's time beside its prediction, in the log's order.
+    """Simulate the commands of an executed script, from the machine's home.
 
-    A row has real and predicted time [s] of the line; its 5 % to 95 % range is None where
-    none is measured.
+    Rows, in the log's order, have real and predicted time [s]; the 5 % to 95 % range is
+    None where none is measured.
     """
     rows = []
     for x, step in zip(log, _plan(log, machine).steps, strict=True):
@@ -558,10 +557,10 @@ def _log(time: float) -> float:
 
 
 def _later(times: Times) -> list[float]:
-    """Return the logarithms of the later half's times over the earlier half's median,
-    divided by sqrt(1 + 1/h) of h earlier times.
+    """Return logarithms of the later half's times over the earlier half's median.
 
-    The later half is empty for a single time."""
+    They are divided by sqrt(1 + 1/h) of h earlier times.
+    """
     half = (len(times) + 1) // 2
     middle = _log(median(times[:half]))
     scale = math.sqrt(1.0 + 1.0 / half)

@@ -95,13 +95,12 @@ class MotorTargets:
         return out
 
     def solved(self, wanted: Mapping[str, float]) -> dict[str, float]:
-        """Solve for the motors' positions that bring quantities to the `wanted` values [mm].
+        """Solve for the motors' positions that bring quantities to the `wanted` values
+        [mm].
 
-        One after the other in the order of `wanted`, each by its driver, with all other motors
-        at home. A quantity without a driver is not brought anywhere. Limits are not checked.
-        `wanted`: quantity -> value [mm].
-        Returns motor -> position to six decimals, of all motors that move these quantities;
-        those that set none are at home.
+        One after the other, each by its driver, with all other motors at home; quantities
+        without one stay. Limits are not checked. Returns all motors that move these
+        quantities, to six decimals.
         """
         geometry = self.machine.geometry
         moved = (motor for quantity in wanted for motor in geometry.get(quantity, {}))

@@ -113,8 +113,7 @@ def decode(data: str | bytes) -> str:
 def is_utf16(data: str | bytes) -> bool:
     """Return whether a text seems saved as UTF-16, which no scanner writes.
 
-    It does by a byte order mark, or if all bytes at even, or all at odd, places of the
-    first 40 are zero and some at the others are not (of 4 bytes or more).
+    By its mark, or zeros at either all even or all odd of the first 40 bytes.
     """
     if isinstance(data, bytes):
         head = data[:40]
@@ -126,12 +125,10 @@ def is_utf16(data: str | bytes) -> bool:
 
 
 def is_binary(data: str | bytes) -> bool:
-    """Return whether a file is an image, an archive or the like, by its control
-    characters.
+    """Return whether a file is an image or the like, by its control characters.
 
-    They are more than `MAX_CONTROL_SHARE` of its first `BINARY_HEAD_BYTES`. A text of
-    fewer than `MIN_BINARY_BYTES` never is. The binary argument of one `set sample info`
-    in a script of some lines is far less.
+    They are more than `MAX_CONTROL_SHARE` of its head; a script's binary argument is far
+    less. Short texts never are.
     """
     head = data[:BINARY_HEAD_BYTES]
     if isinstance(head, str):
@@ -196,14 +193,9 @@ def _lines(text: str) -> Iterator[tuple[int, str]]:
 def _blob_end(parts: list[str], ends: list[str], first: int, crlf: bool) -> int:
     """Find the part that ends the binary argument begun in part `first`.
 
-    It ends where a line ends with a wait column. In a file with CRLF the search stops at the
-    first CRLF, since an end of line within the data is a lone CR or LF there; it never goes
-    beyond `_MAX_BLOB_LINES` parts.
-    `parts`: pieces of the text between line ends; `ends`: the line end behind each piece;
-    `first`: index of the piece in which the argument begins; `crlf`: whether the file has CRLF
-    line ends.
-    Returns index of the part, in a file with CRLF that of the first CRLF if no wait is found;
-    else `first`.
+    It ends where a line ends with a wait column. With `crlf` the search stops at the
+    first CRLF, as data have a lone CR or LF. `ends`: behind each part. Without a wait:
+    `first`, or with CRLF that part.
     """
     joined = ""
     for i in range(first, min(first + _MAX_BLOB_LINES, len(parts))):
@@ -275,9 +267,8 @@ def _blob_columns(text: str) -> tuple[Field, ...]:
 def _field(piece: str, start: int, *, keep: bool = False) -> Field:
     """Make a field with blanks stripped, unless `keep`.
 
-    `piece`: its text; `start`: index of the first character in the line; `keep`: whether blanks
-    stay.
-    Returns the field; its column, from 1, is that of the first character left.
+    Its column, from 1, is that of the first character left; `start` is the piece's, from
+    0.
     """
     if keep or not piece:
         return Field(piece, start + 1)

@@ -281,14 +281,10 @@ def _load_inputs(
 def _load_data_sets(
     folders: list[Path], geometries: list[Path], known: Given
 ) -> list[DataSet]:
-    """Load the data sets, each with its own geometry or the one of a file.
+    """Load the data sets, each with its own geometry or that of its file.
 
-    Without geometries each data set keeps its own; with them folders of anybody's TIFFs are data
-    sets, too. Order is that of the folders.
-
-    `folders`: of the data sets; `geometries`: one file for each, or none; `known`: detector
-    shape and pitch that the files lack.
-    Raises typer.BadParameter: another number of geometries.
+    With files, folders of anybody's TIFFs are data sets, too. `known`: detector shape and
+    pitch that files lack. Raises typer.BadParameter: another number of geometries.
     """
     from flexdt.library.reading.folders import load_dataset
 
@@ -420,9 +416,8 @@ def _push(
 ) -> None:
     """Put a correction in force on the twin, with a note on standard error.
 
-    A motion is not put in force, and warned of.
-    `twin`: connects to it. `correction`: name and offsets. `source`: name of the data set.
-    `document`: of the result, which may contain a motion; a twin's correction cannot."""
+    A motion in `document` is not, with a warning. `source`: of the data set.
+    """
     with twin() as client:
         push_correction(client, correction, source)
     note(f"in force on the twin: {correction.name}")
@@ -543,8 +538,9 @@ def motions(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def parameter_rows(document: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Make rows of text of the parameters that were asked for, in the report's order: name,
-    value, sigma, its part from the images, unit. Numbers have the digits that sigma leaves.
+    """Make rows of the parameters asked for: name, value, sigma, images' part, unit.
+
+    Digits are those that sigma leaves.
     """
     return [
         (

@@ -245,16 +245,9 @@ def _option(name: str) -> str:
 def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report | None]:
     """Read the chosen correction, and the report that it comes from.
 
-    None as `named` gives (None, None); "none", or a twin without a calibration in force,
-    gives zero offsets without report; a file gives its offsets and its report. The twin
-    is used only for "twin", and gives no report.
-
-    Args:
-        named: a report's file, "twin" or "none"; None for the scan's own.
-        twin: connects, for "twin" only.
-
-    Returns:
-        Offsets and report; None for each that there is not.
+    "none", or a twin without a calibration in force, gives zero offsets; a file gives
+    offsets and report; None is for the scan's own, (None, None). The twin is only used
+    for "twin".
     """
     from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
@@ -685,11 +678,9 @@ def import_(
 
 
 def read_geometry(file: Path, known: Given | None = None) -> ConeVec:
-    """Load a scan's geometry from a file of any format that `ConeVec.load` knows.
+    """Load a scan's geometry from a file of any format of `ConeVec.load`.
 
-    Args:
-        file: the geometry.
-        known: detector shape and pitch that it lacks; None for none.
+    `known`: detector shape and pitch that it may lack.
     """
     from flexdt.twin.geometry.cone_vec import ConeVec
 

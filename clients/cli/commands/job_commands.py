@@ -186,11 +186,9 @@ def _on_job(does: str, method: str, steers: str | None = None) -> Callable[..., 
     """
 
     def command(twin: Twin, job: Job = None) -> Answer:
-        """Call the method for a job (None: the current one) of the twin; print its
-        warnings, and yield its status as a document and as a line.
+        """Call the twin's method for a job (None: the current one); print its warnings.
 
-        Errors of the twin are raised; with `steers` a missing current job raises
-        CommandError.
+        With `steers` a missing current job raises CommandError.
         """
         with twin() as client:
             if job is None and steers is not None:
@@ -207,8 +205,7 @@ def _on_job(does: str, method: str, steers: str | None = None) -> Callable[..., 
 def _require_current(client: TwinClient, verb: str) -> None:
     """Check that there is a current job, for a command that names none.
 
-    `client`: connected to the twin; `verb`: of the command, for the error.
-    Raises CommandError: no job is queued, running or paused; its exit code is REFUSED.
+    Raises CommandError: nothing to `verb`; exit code REFUSED.
     """
     from flexdt.clients.client.twin_methods import FINAL_STATES
 
@@ -227,8 +224,7 @@ def forget(
     """Forget an ended job; its data set stays.
 
     Yields:
-        The forgotten jobs as document of --json, then a line with their names. "all"
-        forgets all that have ended; the twin refuses one that runs.
+        The forgotten jobs as document of --json, then a line with their names.
     """
     with twin() as client:
         if job == ALL:

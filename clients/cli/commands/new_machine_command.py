@@ -128,10 +128,10 @@ def new(
 
 
 def _ask_or_default(question: str, given: str | None, usual: str) -> str | None:
-    """Return the given value, else the answer of a person at a terminal; None for the usual one.
+    """Return the given value, else a terminal's answer; None for the usual one.
 
-    Without a terminal on stdin, the given value is returned, None too. The question is on
-    standard error; an answer equal to `usual` gives None."""
+    Without a terminal that is `given`.
+    """
     if given is not None or not sys.stdin.isatty():
         return given
     answer: str = typer.prompt(question, default=usual, err=True)

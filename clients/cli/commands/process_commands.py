@@ -117,12 +117,11 @@ gateway = alone("gateway")
 
 
 def start(name: str, more: Sequence[str]) -> None:
-    """Run a process in this interpreter, with the settings file's options and then
-    those of `more`.
+    """Run a process in this interpreter, with the settings file's options, then `more`.
 
-    It ends by typer.Exit; if `more` requests the help, that is shown and nothing runs.
-    Raises typer.BadParameter and TwinError for options that do not hold, before the
-    process begins."""
+    It ends by typer.Exit. Raises typer.BadParameter and TwinError for wrong options,
+    before it begins.
+    """
     settings = settings_of(TABLES[name], more)
     if settings is not None:
         given = {f.name: getattr(settings, f.name) for f in fields(settings)}

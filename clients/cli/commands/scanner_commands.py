@@ -346,12 +346,11 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
 
 
 def _outwait(client: TwinClient, axis: str, duration_s: float) -> State:
-    """Wait until a jog's lease has ended or the axis rests, and return the state then.
+    """Wait until a jog's lease has ended or the axis rests; return the state then.
 
-    The last lease runs out by itself, to the moment. At the fastest clock every lease
-    does: a renewal could come before or after its end, and the time of motion would be
-    unknown. `duration_s` counts on the twin's clock; the state is requested every
-    `JOG_POLL_S` seconds."""
+    The lease runs out by itself: a renewal could come after its end. `duration_s` is by
+    the twin's clock.
+    """
     now = client.state()
     end = now.time + duration_s  # counted from after its start, not from before
     while now.time < end and now.axes[axis].moving:
@@ -665,16 +664,13 @@ def save(
     dark_is_dense: bool = False,
     marks: npt.NDArray[Any] | None = None,
 ) -> None:
-    """Write an image as TIFF, or windowed to 8 bit as PNG, with its marks in color.
+    """Write an image (rows, cols) as TIFF, or windowed to 8 bit as PNG.
 
-    An existing file is replaced. A TIFF, for any ending but .png, holds the image
-    unchanged.
+    An existing file is replaced. Any ending but .png makes a TIFF, unchanged.
 
     Args:
-        file: its ending selects the format.
-        image: (rows, cols).
         dark_is_dense: draw dense parts dark, in a PNG.
-        marks: (rows, cols) of pixels to color, in a PNG; None for none.
+        marks: (rows, cols) of pixels to color, in a PNG.
 
     Raises:
         CommandError: it cannot be drawn as PNG.

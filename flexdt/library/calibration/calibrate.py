@@ -424,11 +424,10 @@ def _outcome(
 
 @contextmanager
 def saturation_named(saturated: Sequence[Finding]) -> Iterator[None]:
-    """Run the body of a `with`, and prefix its TwinError with the findings on saturated
-    images that explain it; without such findings the error passes.
+    """Prefix the block's TwinError with the findings on saturated images.
 
     Raises:
-        TwinError: the error that was raised, preceded by the saturated images.
+        TwinError: the error, also as it was without such findings.
     """
     try:
         yield
@@ -457,12 +456,11 @@ def with_undetermined(result: Calibration) -> Calibration:
 
 
 def saturation(dataset: ImageSet) -> Finding | None:
-    """Return a warning if the open beam saturates the detector: at least 1 % of every
-    fourth row and column of the flat image reaches 99.9 % of full scale. None otherwise,
-    without a machine, or without flat images in files.
+    """Return a warning if the open beam saturates the detector, else None.
 
-    Thin objects are invisible then. Calibration survives it (beads are dark), but the
-    body that is subtracted differs from the one in the images.
+    At least 1 % of every fourth row and column of the flat image reaches 99.9 % of full
+    scale. None without machine or flat images. The subtracted body then differs from the
+    images'.
     """
     if dataset.machine is None or not dataset.flats:
         return None

@@ -147,11 +147,10 @@ class Scale:
 
 
 def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Markers:
-    """Read the markers of a CSV or NumPy file, or collect given marks.
+    """Read the markers of a file (.npy: NumPy, else CSV), or collect given marks.
 
-    `source`: the file's path (.npy: NumPy, else CSV), or the marks; `views`: how many
-    frames there are. Returns markers by name; without marks there are none. Raises TwinError:
-    the file cannot be read or is invalid; names the line.
+    `views`: number of frames. Returns markers by name; without marks there are none.
+    Raises TwinError: cannot be read or invalid; names the line.
     """
     if not isinstance(source, str | PathLike):
         return _gathered((_mark(f"mark {i}", row) for i, row in enumerate(source)), views)
@@ -427,24 +426,19 @@ def calibrate_unknown(
 ) -> tuple[Calibration, dict[str, object]]:
     """Calibrate from three or more markers of unknown positions.
 
-    The markers define the object's frame: its height, turn and place on the axis (dO_y, alpha,
-    tau_x, tau_z) are those of the request's start. Images determine only the ratio of their
-    scale and the distance of the axis; one of these states it: `scale`, a prior on dO_z, or a
-    free dO_z. Without any, dO_z has a wide prior, of `FREE_SCALE` times the SOD. With `scale`
-    markers and axis are scaled and fitted up to four times.
+    The markers define the object's frame: its height, turn and place on the axis (dO_y,
+    alpha, tau_x, tau_z) are the start's. Images determine only the ratio of their scale
+    and the axis' distance: `scale` states it, a prior on dO_z, or a free dO_z; else dO_z
+    has a wide prior, `FREE_SCALE` times the SOD.
 
     Args:
-        data: geometry, and names.
-        images: its frames, None for markers without images.
-        markers: their pixels; None: detected in the images.
-        request: the parameters to estimate.
+        images: frames, None for markers without images.
+        markers: None: detected in the images.
         scale: a known distance of two of them.
-        detector: finds spots in the images.
 
-    Returns the calibration, and the document: markers (of `_described`) and scale, a text: the
-    stated one, "estimated", "free" or "from the prior on dO_z".
-    Raises TwinError: fewer than three markers, one that is seen from too few directions, neither
-    images nor markers, or a scale with dO_z free, with one marker or with one that is not there.
+    Returns the calibration, and the document: markers, and scale as a text.
+    Raises TwinError: fewer than three markers, one seen from too few directions, neither
+    images nor markers, or a scale with dO_z free or markers that are not there.
     """
     sod = float(np.median(data.poses.sod))
     if markers is not None:
@@ -710,15 +704,9 @@ def _numbered(names: Sequence[str], name: str) -> int:
 
 
 def _radii(looks: Sequence[FrameSpots], index: Index, poses: Poses) -> FloatArray:
-    """Compute the radii of balls whose spots have the observed sizes.
+    """Compute the radii (k,) [mm] of balls whose spots have the observed sizes.
 
-    Args:
-        looks: spots of n frames.
-        index: (n, k) spot of each marker in each frame, -1 without.
-        poses: geometry of the frames.
-
-    Returns:
-        (k,) medians [mm]; NaN for a marker that no frame shows.
+    `index`: (n, k) spot of each marker, -1 without. Medians; NaN if no frame shows one.
     """
     scale = np.linalg.norm(poses.u, axis=1) * poses.sod / poses.sdd
     return np.array(

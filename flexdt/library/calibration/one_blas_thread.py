@@ -34,11 +34,10 @@ _USES: Final = _Uses()
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Let each OpenBLAS that is loaded use one thread within; other libraries stay as they are.
+    """Let each loaded OpenBLAS use one thread within.
 
-    Its threads wait for each other several times in a call. On a busy machine a wait lasts
-    until the system gives the other thread its turn: milliseconds, in a call of 0.1 ms. Uses
-    may overlap in several threads: the last restores what the first found.
+    Its threads wait for each other in a call: milliseconds on a busy machine, in a call
+    of 0.1 ms. Of overlapping uses the last restores what the first found.
     """
     with _USES.lock:
         _USES.count += 1

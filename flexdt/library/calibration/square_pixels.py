@@ -86,9 +86,7 @@ class ResampledRows:
         return np.rint(counts).clip(0, np.iinfo(np.uint16).max).astype(np.uint16)
 
     def flats(self) -> Float32Array | None:
-        """Return the resampled mean flat image, (1, rows, cols) [counts]; None if there
-        is none.
-        """
+        """Return the resampled mean flat image, (1, rows, cols) [counts], or None."""
         try:
             return self.of(self.original.flat)[None]
         except DatasetMissingError:

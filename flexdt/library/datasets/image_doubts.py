@@ -46,12 +46,10 @@ def saturated_part(what: str, share: float) -> str:
 
 
 def first_look(paths: Mapping[str, Path], full_scale: int) -> list[str]:
-    """Check images for saturation before anything is computed from them.
+    """Check images of each kind for saturation before anything is computed from them.
 
-    `paths`: one image of each kind, which the sentence names. An unreadable image is skipped;
-    reading it later is an error. `full_scale`: largest count of the panel.
-    Returns one sentence, of the first kind of which at least `WARNING_SHARE` of the pixels is
-    saturated; else [].
+    Returns a sentence of the first kind with `WARNING_SHARE` of its pixels saturated;
+    else []. Unreadable images are skipped.
     """
     for kind, path in paths.items():
         try:
@@ -66,27 +64,18 @@ def first_look(paths: Mapping[str, Path], full_scale: int) -> list[str]:
 def image_doubts(
     scan: ImageSet, *, needed: bool = False, counts: Callable[[int], Counts] | None = None
 ) -> list[str]:
-    """Find saturated or starved pixels and changes of the beam that make a scan's line
-    integrals doubtful; what opening told of its reference images is told once more.
+    """Find saturated or starved pixels and changes of the beam that make line integrals
+    doubtful.
 
-    Saturated pixels are those with the panel's largest count. Where that is not known, it
-    is the largest among the images if it is one at which converters end (2^bits - 1). All
-    radiographs in memory are examined, `MAX_FROM_DISK` of those in files, and the flat
-    image. A share of at least `WARNING_SHARE` is a doubt; starved pixels have fewer than
-    `FEW_COUNTS` above dark. Pixels without an open beam have a doubt of their own; these,
-    and those that the data set interpolates, are left out of the others.
+    Saturated pixels have the panel's largest count, or else the images', if converters
+    end there (2^bits - 1). All radiographs in memory are examined, `MAX_FROM_DISK` of
+    those in files, and the flat image. A share of `WARNING_SHARE` is a doubt; starved
+    pixels have fewer than `FEW_COUNTS` above dark. Pixels without an open beam have their
+    own; they and interpolated ones are left out of others.
 
-    Args:
-        scan: the data set.
-        needed: line integrals are.
-        counts: gives those of a frame in a file by its index; None reads them.
-
-    Returns:
-        Sentences; [] where line integrals were given instead of counts.
-
-    Raises:
-        DatasetFormatError: line integrals are `needed`, and the images hold none: no
-            pixel of the flat image is brighter than the dark one, or all are saturated.
+    `counts` gives those of a frame by its index; None reads them. Returns [] where line
+    integrals were given.
+    Raises DatasetFormatError: these are `needed`, and the images hold none.
     """
     if scan.arrays is not None and scan.arrays.integrals is not None:
         return []  # they were given, not exposed

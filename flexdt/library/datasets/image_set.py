@@ -705,10 +705,10 @@ def _normalise(
 
 
 def _blank(counts: Counts) -> npt.NDArray[np.bool_]:
-    """Mark images (n, rows, cols) that are zero everywhere; pixels of one row decide for most.
+    """Mark images (n, rows, cols) that are zero everywhere.
 
-    The pixels are every 41st of the middle row; only if all are zero the whole image is
-    searched."""
+    Every 41st pixel of the middle row decides for most.
+    """
     blank: npt.NDArray[np.bool_] = counts[:, counts.shape[1] // 2, ::41].max(axis=1) == 0
     for i in np.flatnonzero(blank):
         blank[i] = not counts[i].any()

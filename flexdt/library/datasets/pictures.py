@@ -71,12 +71,10 @@ def windowed(
 def coloured(
     grey: npt.NDArray[np.uint8], marks: npt.NDArray[np.generic]
 ) -> npt.NDArray[np.uint8]:
-    """Draw the marked pixels of a gray picture (rows, cols) in color, (rows, cols, 3)
-    red first; later marks over earlier ones; those of outermost pixels (bit 4) as a band.
+    """Draw the marked pixels of a gray picture in color, (rows, cols, 3).
 
-    Args:
-        grey: the picture.
-        marks: (rows, cols) of bits, see `MARKS`.
+    Later `MARKS` (bits) lie over earlier ones; those of outermost pixels (bit 4) are a
+    band.
     """
     picture = np.repeat(grey[:, :, None], 3, axis=2)
     values = np.asarray(marks, dtype=np.uint8)
@@ -127,12 +125,11 @@ def png(
     marks: npt.NDArray[np.generic] | None = None,
     like: npt.NDArray[Any] | None = None,
 ) -> bytes:
-    """Encode an image as PNG, with percentiles as black and white.
+    """Encode an image (rows, cols) as PNG, with percentiles (of `like`) as black and
+    white.
 
-    `image`: (rows, cols). `dark_is_dense`: encode the negative. `marks`: (rows, cols), see
-    `MARKS`; unless all are zero the picture is in color. `like`: image whose percentiles are
-    taken; `image` itself without.
-    Raises ValueError: it has no pixels, or is no image.
+    `dark_is_dense`: the negative; `marks`: as `MARKS`; unless all are zero the picture is
+    in color. Raises ValueError: no image, or no pixels.
     """
     if image.ndim != 2 or image.size == 0:
         raise ValueError(f"an image has rows and columns, got shape {image.shape}")

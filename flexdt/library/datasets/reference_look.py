@@ -33,11 +33,11 @@ Some = npt.NDArray[Any]
 
 
 def looked_at(data: Images) -> Images:
-    """Return the data set with what its dark and flat images contradict, in `references` and in
-    its warnings; itself where they were looked at before.
+    """Return the data set with what its dark and flat images contradict; itself if looked
+    at.
 
-    Each is compared with the others of its kind, and three projections with their means, in
-    `ROWS` rows. An image that cannot be read is left out: reading it later is an error.
+    Each is compared with others of its kind, and three projections with their means.
+    Unreadable images are left out.
     """
     if data.references is not None:
         return data

@@ -311,10 +311,9 @@ class _Drawing:
 
 
 def _slider_indices(count: int) -> list[int]:
-    """Choose at most `MAX_PICTURES` indices below `count`, evenly spread, of which a
-    slider shows one.
-
-    They ascend from 0 to count - 1; all if there are no more; [] for 0."""
+    """Choose `MAX_PICTURES` evenly spread indices below `count`, ascending; all of
+    fewer.
+    """
     if not count:
         return []
     spread = np.linspace(0, count - 1, min(count, MAX_PICTURES))

@@ -18,14 +18,7 @@ AXES: Final = (("z", 0, "xy"), ("y", 1, "xz"), ("x", 2, "yz"))
 
 
 def layer_of(data: npt.NDArray[Any], axis: int, index: int) -> npt.NDArray[Any]:
-    """Return one layer of a volume (nz, ny, nx), the last axis to the right and the other
-    up.
-
-    Args:
-        data: the volume's values.
-        axis: 0 for z, 1 for y, 2 for x.
-        index: of the layer along it.
-    """
+    """Return a layer of a volume, its last axis right, the other up."""
     layer: npt.NDArray[Any] = np.take(data, index, axis)[::-1]
     return layer
 

@@ -50,10 +50,8 @@ def offered(name: str, group: str) -> Any:
 def extension(name: str, what: str, group: str = "flexdt.extensions") -> Any:
     """Load the object of an entry point of `flexdt-extensions`.
 
-    `name`: of the entry point; `what`: needs it, for the message; `group`: of entry points.
-    Returns the object, e.g. a function.
-    Raises TwinError: no such entry point, as where the distribution is not installed; names the
-    command that installs it.
+    `what` needs it, for the message. Raises TwinError: no such one, with the command that
+    installs it.
     """
     loaded = offered(name, group)
     if loaded is None:

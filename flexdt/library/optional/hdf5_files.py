@@ -36,10 +36,10 @@ _lock: Final = threading.Lock()
 
 @contextmanager
 def hdf5_file(path: Path, what: str) -> Iterator[Any]:
-    """Open an HDF5 file for reading that can be walked through without harm. `path`: of the
-    file; `what`: that needs h5py, for the message. Raises TwinError: the package h5py is not
-    installed; DatasetFormatError: its damage ends, or stops, the process that reads it; OSError:
-    it is no HDF5 file, or missing."""
+    """Open an HDF5 file for reading, if it is sound.
+
+    Raises TwinError: `what` needs h5py; DatasetFormatError, OSError.
+    """
     h5py = package("h5py", what)
     _require_sound(path, h5py)
     with h5py.File(path) as file:

@@ -676,9 +676,9 @@ def _from_geometry(content: Folder) -> DataSet:
 
 
 def _settings_beside(content: Folder, kV: float | None) -> ScanSettings | None:
-    """Read the settings of a scanner's text beside a saved geometry, with the voltage that
-    this states; None without either. A text that cannot be read is none: nothing here
-    depends on it.
+    """Read the settings in a scanner's text, with the voltage of a saved geometry.
+
+    None without either; a text that cannot be read is none.
     """
     try:
         found = read_settings(content, [])

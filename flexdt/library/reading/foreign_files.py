@@ -127,11 +127,11 @@ def open_file(
 
 
 def format_of(path: Path) -> ScanFormat | None:
-    """Find the format of a file by its ending, whatever its case, and its content.
+    """Find the format of a file by its ending (of any case) and its content.
 
-    Of the formats with its ending the first whose content it has counts; a file with none of
-    them is that of the first without such a check.
-    Returns the format; None for an ending that no format has, or another content."""
+    The first whose content it has counts, then the first that checks none. None for an
+    unknown ending or other content.
+    """
     forms = [form for form in SCAN_FORMATS if path.suffix.lower() in form.endings]
     for form in forms:
         if form.holds is not None and path.is_file() and form.holds(path):

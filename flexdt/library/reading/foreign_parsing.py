@@ -51,11 +51,10 @@ def parsing(path: Path, form: str) -> Iterator[None]:
 
 
 def head_text(path: Path) -> str:
-    """Read a text that describes a scan, as UTF-8 with or without a byte order mark, or as
-    UTF-16 with one.
+    """Read a text that describes a scan, as UTF-8 or, with its mark, as UTF-16.
 
-    Bytes that have no character become replacement characters. Raises DatasetFormatError: it is
-    larger than the settings of a scan may be; OSError: it cannot be read."""
+    Raises DatasetFormatError: too large for the settings of a scan; OSError.
+    """
     try:
         raw = limited_bytes(path, "settings")
     except InputLimitError as error:

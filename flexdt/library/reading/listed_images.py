@@ -51,19 +51,10 @@ def without_flat(name: str, names: Sequence[str]) -> str:
 def in_order(
     content: Folder, names: Sequence[str], views: int
 ) -> tuple[list[str], list[str]]:
-    """Sort images by the numbers in their names.
+    """Sort images by the numbers in their names; return doubts about them as sentences.
 
-    Names of another form than the rest stay, with a doubt; they are left out where the
-    others are exactly as many as the views.
-
-    Args:
-        content: where they are.
-        names: of the images.
-        views: number of views of the geometry.
-
-    Returns:
-        The names in order, a repeated one once, and doubts about them as sentences: names
-        of another form, names that are left out, gaps in the numbers.
+    Names of another form stay, with a doubt; they are left out where the others are as
+    many as the views. A repeated name counts once; gaps are doubts.
 
     Raises:
         DatasetFormatError: two have one number.
@@ -82,10 +73,10 @@ def in_order(
 
 
 def doubts_of(content: Folder, geometry: ConeVec, shape: tuple[int, int]) -> list[str]:
-    """List doubts about a geometry for images of a shape (rows, cols), as sentences that name
-    the folder; [] without doubts.
+    """List doubts about a geometry for images of a shape, as sentences.
 
-    Raises DatasetFormatError: no scanner has such a geometry."""
+    Raises DatasetFormatError: no scanner has it.
+    """
     found = examine(Operation.OPEN, geometry, shape)
     if found:
         return settled(found, DatasetFormatError, str(content.path))

@@ -261,15 +261,11 @@ def _stated(ole: Any, path: Path) -> Ledger:
 def _reference(
     file: _Streams, code: int, shape: tuple[int, int]
 ) -> npt.NDArray[Any] | None:
-    """Read the images of the open beam.
+    """Read the images of the open beam, (k, rows, cols); None without any.
 
-    The first folder of REFERENCES that has images counts; they are `Image` and `Image1` to
-    `Image999`.
-
-    `file`: its streams; `code`: type of the pixels where the file does not state it for these;
-    `shape`: (rows, cols).
-    Returns (k, rows, cols); None without any.
-    Raises DatasetFormatError: pixels that are not finite, an unknown type, or another size.
+    The first folder of REFERENCES with images counts, `Image` to `Image999`. `code`:
+    pixels' type, if not stated for these. Raises DatasetFormatError: not finite, unknown
+    type, or another size.
     """
     for folder in REFERENCES:
         names = [

@@ -32,10 +32,10 @@ MIN_TURN_SHARE: Final = 0.2
 def without_bad_pixels(
     dataset: ImageSet, cone_vec: ConeVec, counts: Callable[[int], Counts]
 ) -> tuple[ImageSet, list[str]]:
-    """Find the pixels of a data set that do not respond as their neighbors do, and mark them to
-    be interpolated. `dataset`: the scan; `cone_vec`: of all its frames; `counts`: gives those of
-    a frame by its index. Returns the data set, and one warning that describes the pixels;
-    without any, the data set itself and []."""
+    """Mark the pixels that do not respond as their neighbors, to be interpolated.
+
+    Returns also one warning about them, or [].
+    """
     pixels = _bad_pixels(dataset, cone_vec, counts)
     if pixels is None:
         return dataset, []

@@ -52,17 +52,14 @@ def plan_memory(
     *,
     least: bool = False,
 ) -> MemoryPlan:
-    """Divide a volume into as few slabs as fit into the memory, and decide whether images are
-    kept in memory or on disk.
+    """Divide a volume into as few slabs as fit into the memory, and keep images there or
+    on disk.
 
-    With several slabs all images are kept, as prepared; with one, those that are needed again.
-
-    `grid`: of the volume, (z, y, x) voxels; `images`: of the scan; `again`: images that are
-    needed more than once even of a single slab; `most_pixels`: of an image that is kept;
-    `memory`: to use [bytes]; `least`: take no more slabs than layers where there is too little
-    memory, instead of an error.
-    Raises LimitError: a layer, and the images that are worked on (at most `WORKING_IMAGES`),
-    need more memory; not with `least`.
+    With several slabs all images are kept, as prepared; with one, those that are needed
+    `again`. `most_pixels`: of an image; `memory`: to use [bytes]; `least`: with too
+    little, a slab for each layer.
+    Raises LimitError: a layer and the images worked on (at most `WORKING_IMAGES`) need
+    more; not with `least`.
     """
     work = 4 * most_pixels * min(WORKING_IMAGES, 12 * images)
     layer = grid.bytes // grid.shape[0]

@@ -675,11 +675,9 @@ def _reading_once(
 ) -> Iterator[tuple[KeptImages, Work]]:
     """Read each image once from here on, and report the work done.
 
-    Yields the kept images, on disk or in memory as planned, and the progress; the images are
-    deleted at the end. Iterative methods report no progress here.
-
-    `task`: the reconstruction. `plan`: the split between memory and a file. `folder`: of that
-    file. `tell`: called with the work done and the total, in images; by FDK only.
+    Yields the kept images, on disk or in memory as planned, deleted at the end, and the
+    progress, of FDK only. `folder`: of the file; `tell`: gets the work done and the
+    total, in images.
     """
     views = task.views
     fdk = task.direct

@@ -26,11 +26,10 @@ MAX_UNEVEN_RATIO: Final = 1.3
 def scan_rings(
     view: Callable[[int], Float32Array], cone_vec: ConeVec, shape: tuple[int, int]
 ) -> Float32Array:
-    """Estimate the offset that each pixel of a scan adds to all views, to be subtracted.
+    """Estimate the offset (rows, cols) that each pixel adds to all views.
 
-    `view`: gives the line integrals of a view, (rows, cols), by its number; `cone_vec`: of all
-    views; `shape`: (rows, cols).
-    Returns (rows, cols); 0 where no offset exceeds object and noise."""
+    `view` gives line integrals by number. 0 where none exceeds object and noise.
+    """
     lies = on_its_side(cone_vec)
     numbers = range(len(cone_vec))
     views: Iterator[Float32Array] = (view(k).T if lies else view(k) for k in numbers)

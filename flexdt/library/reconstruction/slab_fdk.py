@@ -219,8 +219,7 @@ class Work:
     ) -> None:
         """Count the work of reading images and of adding slabs.
 
-        `images`: number of images; `reading`: work of reading all of them; `slabs`: work of each
-        slab; `tell`: called with the share done in images, and all images.
+        `tell` gets the share done, and all, in images.
         """
         self._images = images
         self._reading = reading

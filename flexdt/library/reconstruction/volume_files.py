@@ -43,20 +43,14 @@ NO_PLACE: Final = (
 def volume_writer(
     path: Path, grid: Grid | VoxelPlaces, about: Mapping[str, str] | None = None
 ) -> Iterator[Sink]:
-    """Open `path` for a volume on `grid`, and yield the function that takes its slabs;
-    the ending chooses the format.
+    """Open `path` for a volume on `grid`, and yield the function that takes its slabs.
 
-    The file gets its name when all slabs are written; after an error none is left.
-
-    Args:
-        path: of the file.
-        grid: of the volume.
-        about: what it is of and how it was made, as far as the format has room: word -> one line.
+    The ending chooses the format. The file gets its name when all are written; after an
+    error none is left. `about`: how it was made, word -> one line.
 
     Raises:
-        LimitError: another ending, a missing folder, or too little room on the disk for a
-            format without compression.
-        TwinError: the package that writes the format is not installed.
+        LimitError: another ending, no folder, or too little room.
+        TwinError: the format's package is not installed.
         OSError: the file cannot be written.
     """
     form = check_name(path)
@@ -91,11 +85,9 @@ def ending(path: Path) -> str:
 
 
 def check_name(path: Path) -> VolumeFormat:
-    """Return the volume format of a file name, by its ending, before any work.
+    """Return the volume format of a file name, by its ending.
 
-    Raises:
-        LimitError: an unknown ending, or the folder does not exist.
-        TwinError: the package that writes the format is not installed.
+    Raises LimitError: an unknown ending, or no folder; TwinError: a missing package.
     """
     form = _format(path)
     if not path.absolute().parent.is_dir():
@@ -128,14 +120,7 @@ def _format(path: Path) -> VolumeFormat:
 
 
 def labelled(volume: Volume, about: Mapping[str, str]) -> Volume:
-    """Return a volume whose files say what it is of and how it was made; the data are shared.
-
-    Volumes derived from it say nothing of it: it is no field.
-
-    Args:
-        volume: not changed; keeps its errors.
-        about: word -> one line, as `volume_writer` takes it.
-    """
+    """Return a volume whose files say how it was made."""
     told = with_errors(volume)
     object.__setattr__(told, "_about", dict(about))
     return told
@@ -230,9 +215,7 @@ class MiddleSlices:
 
     @property
     def images(self) -> dict[str, npt.NDArray[np.float32]]:
-        """Middle slices by name, top row first: xy (from above, +y up), xz, yz (+z up);
-        layers not taken are zero.
-        """
+        """Middle slices by name, top row first; layers not taken are zero."""
         return {
             "xy": self._across_z[::-1],
             "xz": self._across_y[::-1],

@@ -168,9 +168,10 @@ class VolumeFormat:
 def _write_and_rename(
     write: Callable[[Path, VoxelPlaces], Iterator[Sink]],
 ) -> Callable[..., Iterator[Sink]]:
-    """Wrap the writer of one file: it writes to a temporary path, which gets the final name at
-    the end; after an error it does not. Returns a generator function of (temporary path, final
-    path, places), which yields the function that takes the slabs."""
+    """Wrap the writer of one file: it writes to a temporary path.
+
+    That gets the final name at the end, but not after an error.
+    """
 
     def write_whole_file(part: Path, path: Path, places: VoxelPlaces) -> Iterator[Sink]:
         yield from write(part, places)

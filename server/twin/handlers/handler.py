@@ -97,12 +97,10 @@ def ensure_allowed(twin: TwinServer, client: Client, what: str) -> Callable[[], 
 def ensure_idle(
     twin: TwinServer, client: Client, method: str, what: str
 ) -> Callable[[], None]:
-    """Return a check, to be called later, that raises if another client has control or a job
-    would be disturbed.
+    """Return a check that raises RpcError -32003 if another client has control.
 
-    `twin` and `client`: whose control and jobs; `method`: named in the error of control; `what`:
-    named in the error of the job.
-    Returns the check; it raises RpcError -32003."""
+    Or if a job would be disturbed, by `what`; `method` is for the error.
+    """
 
     def check() -> None:
         """Raise RpcError -32003 if another has control, or a job would be disturbed."""

@@ -130,15 +130,9 @@ def _predicted_shot(
 
 
 def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec) -> None:
-    """Check that an image fits into one answer of the connection.
+    """Check that an image of (rows, cols) before binning fits into one answer.
 
-    Counts take 2 bytes a pixel, line integrals 4, marks one more; 4096 bytes are left for the
-    rest.
-
-    Args:
-        shape: (rows, cols) before binning.
-        params: kind, binning and marks.
-        codec: of the connection; any but MessagePack needs a third more.
+    4096 bytes are left for the rest; any codec but MessagePack needs a third more.
 
     Raises RpcError: -32008, it does not fit; names both sizes [bytes].
     """

@@ -82,10 +82,9 @@ async def _unreached_targets(twin: TwinServer, wanted: Mapping[str, float]) -> l
 
 @contextmanager
 def _cancelling_detour(twin: TwinServer) -> Iterator[None]:
-    """Run a command of motion, then cancel a way around obstacles and publish the change.
+    """Run a command of motion, then cancel a way around obstacles.
 
-    The way is canceled if the command succeeds or has changed the motors' programmes.
-    After a command that raises without a change it goes on.
+    One that raises without changing motors' programmes lets it go on.
     """
     before = twin.scanner.programmes
     refused = True
@@ -147,12 +146,9 @@ async def _move_around_obstacles(
 
 @answers(p.AXES_JOG)
 def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
-    """Run an axis at a velocity until the lease ends or as far as it is free (see
-    `twin.motion.drives.plan_jog`).
+    """Run an axis at a velocity until the lease ends or as far as it is free.
 
-    A way around obstacles is canceled.
-
-    Returns the duration [s], a warning if the jog is cut short, and `moves` None.
+    Warns if it is cut short, and cancels a way around obstacles.
     """
     with _cancelling_detour(twin):
         jogged = twin.scanner.jog(
@@ -191,10 +187,9 @@ async def set_axis(
 
 @answers(p.AXES_STOP)
 def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
-    """Bring the motors to rest; a running scan pauses, and a way around obstacles is canceled.
+    """Bring the motors to rest; a running scan pauses, a detour is canceled.
 
     It counts as a stop even if nothing moves. X-rays stay as they are.
-    Returns the state with the stopping motion.
     """
     twin.detours.cancel()
     twin.interrupt("stop")
@@ -225,9 +220,9 @@ async def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
 
 @answers(p.SAFETY_RESET)
 def reset(twin: TwinServer, client: Client, params: p.Reset) -> w.State:
-    """Leave E-stop or blocked state, if `stop` (None: any) is the latest stop; return the state.
+    """Leave E-stop or blocked state, if `stop` (None: any) is the latest.
 
-    It does not wait for the disk: a reset that a kill loses leaves the E-stop in force.
+    It does not wait for the disk.
     """
     twin.scanner.reset(twin.clock.now(), params.stop)
     twin.changed()

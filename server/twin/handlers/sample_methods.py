@@ -266,12 +266,11 @@ def _ensure_unused(twin: TwinServer, name: str) -> None:
 
 
 def _ensure_replaceable(twin: TwinServer, client: h.Client, name: str) -> None:
-    """Check that a file may come under a name: if there is one, under this connection's control,
-    which is taken where it is free; if it is on the stage, while nothing moves.
+    """Check that a file may come under a name: with control, while nothing moves on the
+    stage.
 
-    A scan that has begun with the file there, also one that a job could resume, would be refused
-    from then on.
-    Raises RpcError: -32003, names the controller or the job.
+    Control is taken where it is free. A scan that has begun with the file there would be
+    refused. Raises RpcError: -32003.
     """
     if twin.samples.head(name) is not None:
         before = twin.control.holder
@@ -291,11 +290,9 @@ def _shipped_info(name: str) -> p.SampleInfo:
 def _sample_info(
     name: str, phantom: Phantom, head: UploadHead | None = None
 ) -> p.SampleInfo:
-    """Describe a sample for the list: name, kind, description, size [mm], and whether it was
-    uploaded.
+    """Describe a sample for the list.
 
-    `name`: of the sample. `phantom`: gives description and size. `head`: description of an
-    upload, which gives the kind; None for a shipped phantom, of kind "phantom".
+    `head`: of an upload, which gives the kind; None for a shipped phantom.
     """
     return p.SampleInfo(
         name=name,

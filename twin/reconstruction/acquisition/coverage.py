@@ -174,11 +174,11 @@ HELIX_TAPER_RAD = 0.2
 
 
 def ends_not_seen_mm(cone_vec: ConeVec) -> float:
-    """Compute how much of the field of view at either end of a helix FDK cannot fill.
+    """Compute the height [mm] at either end of a helix that FDK cannot fill; 0 without a
+    helix.
 
-    A layer needs the views of a turn, and of the taper at both ends, which rise so far.
-    `cone_vec`: the scan.
-    Returns [mm] along z; 0 for scans that are no helix."""
+    A layer needs the views of a turn and of the taper at both ends.
+    """
     try:
         circle = circle_of(cone_vec)
     except GeometryError:

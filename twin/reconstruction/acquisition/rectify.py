@@ -137,10 +137,11 @@ def homography(
     """
 
     def plane(row: FloatArray, rows: int, cols: int) -> FloatArray:
-        """Compute the matrix (3, 3) that takes a pixel (column, row, 1) to its ray: columns u,
-        v, first pixel minus source.
+        """Compute the matrix (3, 3) from pixels (column, row, 1) to rays: u, v, first
+        pixel's ray.
 
-        `row`: cone_vec row (12,); `rows` and `cols`: of its panel."""
+        `row`: of cone_vec (12,).
+        """
         first = (
             row[3:6] - row[0:3] - (cols - 1) / 2 * row[6:9] - (rows - 1) / 2 * row[9:12]
         )

@@ -102,13 +102,7 @@ class Circle:
 
 
 def no_fdk(why: str, asked: object, allowed: object) -> GeometryError:
-    """Make (do not raise) the error that FDK cannot use a trajectory; it advises the
-    iterative methods.
-
-    Args:
-        why: reason, the message's beginning.
-        asked, allowed: figures of the error's details.
-    """
+    """Make (do not raise) the error that FDK cannot use a trajectory, with an advice."""
     what_can = "the iterative methods (sirt, sart, cgls, em) take any trajectory"
     return GeometryError(f"{why}; {what_can}", {"asked": asked, "allowed": allowed})
 
@@ -174,12 +168,11 @@ def _circle_of(sources: bytes) -> Circle:
 
 
 def distinct_angles(circle: Circle) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Find the first views of different angles, and which of them each view repeats.
+    """Find the first views of different angles, (k,) by angle, and which each view
+    repeats, (n,).
 
-    Angles are equal to 1e-9 rad; on a circle modulo a turn, on a helix not. Neither result
-    depends on the order of views, except in which of equal ones is the first. `circle`: n views.
-    Returns views of different angles in order of angle, (k,), and the position in that list for
-    each view, (n,)."""
+    Angles are equal to 1e-9 rad; on a circle modulo a turn, on a helix not.
+    """
     if circle.rise:
         angle = circle.angle.round(9)
     else:
@@ -238,11 +231,10 @@ def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
 
 
 def _usual(steps: FloatArray) -> float:
-    """Find the usual step: narrower ones make up a third of the total, so that repeated turns do
-    not matter.
+    """Find the usual of steps (k,) [rad], a full turn without any.
 
-    `steps`: (k,) [rad].
-    Returns [rad]; a full turn if there are no steps."""
+    Narrower ones make up a third of the total: repeated turns do not matter.
+    """
     ordered = np.sort(steps)
     covered = np.cumsum(ordered)
     if len(steps):
@@ -359,14 +351,11 @@ def narrow_overlap(circle: Circle, cone_vec: ConeVec, cols: int) -> bool:
 
 
 def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> ConeVec:
-    """Move panels along their rows, by up to a quarter of a column, so that the axis is on a
-    column or halfway between two.
+    """Move panels along rows, a quarter of a column at most: the axis is on or between
+    columns.
 
-    Where the weights of a ray and its opposite change within few columns, the weights'
-    contribution to the filtered rows is large, odd about the axis, and cancels only if both are
-    sampled alike.
-    `circle`: of the sources; `cone_vec`: n views; `shape`: detector (rows, cols).
-    Returns new geometry; each view is moved by its own amount.
+    The weights' contribution to the filtered rows is odd about the axis, and cancels only
+    where a ray and its opposite are sampled alike. Each view moves by its own amount.
     """
     axis = np.array([[*circle.centre, 0.0]])
     at = cone_vec.project_points(axis, shape)[:, 0, 0]
@@ -380,10 +369,11 @@ def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> C
 
 
 def _confidence(circle: Circle, angle: FloatArray) -> FloatArray:
-    """Compute the confidence in views at some angles: it falls smoothly, as a squared sine over
-    `GAP_RAMP_RAD`, towards an arc without views ("gap"). `circle`: with its gaps; `angle`: of
-    any shape [rad]. Returns of the same shape, 1e-12 in a gap to 1; 1 everywhere on a full
-    circle."""
+    """Compute the confidence in views at angles [rad]: 1, and 1e-12 in an arc without
+    views.
+
+    It falls over `GAP_RAMP_RAD`.
+    """
     from_gap = circle.from_gap(angle)
     return np.asarray(
         np.sin(np.pi / 2 * np.minimum(from_gap / GAP_RAMP_RAD, 1.0)) ** 2 + 1e-12
@@ -421,12 +411,12 @@ def _check_covered(circle: Circle, widest: float) -> None:
 
 
 def _unseen(gaps: FloatArray, widest: float) -> float:
-    """Compute the largest overlap of an arc without views with the opposite of any such arc,
-    widened by the fan.
+    """Compute the largest overlap [rad] of an arc without views with the opposite of
+    another.
 
-    `gaps`: (k, 2) first and last angle [rad]; `widest`: fan angle to either side [rad].
-    Returns overlap [rad]; at most 0 if every line of a gap is seen from its other side, minus a
-    turn without gaps."""
+    `gaps`: (k, 2) angles; `widest`: fan angle to either side [rad]. 0 or less if every
+    line is seen from its other side.
+    """
     width = np.diff(gaps)[:, 0]
     middle = gaps.mean(axis=1)
     apart = np.abs(
@@ -436,11 +426,8 @@ def _unseen(gaps: FloatArray, widest: float) -> float:
 
 
 def reach(fan: FloatArray) -> tuple[float, float]:
-    """Compute the fan angles that all views have on the clockwise side and on the other,
-    both positive for an axis on the panel [rad].
-
-    Args:
-        fan: (n, cols) [rad].
+    """Compute the fan angles (n, cols) that all views have, clockwise and not, both
+    positive.
     """
     return -float(fan.min(axis=1).max()), float(fan.max(axis=1).min())
 
@@ -484,28 +471,14 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def fan_angles(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
-    """Compute the horizontal angle of each column's ray from the line from the source to
-    the axis.
-
-    Args:
-        circle: of the sources.
-        cone_vec: n upright views.
-        cols: columns of the panel.
-
-    Returns:
-        (n, cols) [rad], positive counter-clockwise seen from above.
+    """Compute each column's horizontal angle from the line to the axis, (n, cols)
+    [rad].
     """
     return _angles_at(circle, cone_vec, np.arange(float(cols)) - (cols - 1) / 2)
 
 
 def panel_reach(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[float, float]:
-    """Compute `reach` of a panel from as few columns as hold its ends.
-
-    Args:
-        circle: of the sources.
-        cone_vec: n upright views.
-        cols: columns of the panel.
-    """
+    """Compute `reach` of a panel from the few columns that hold its ends."""
     return reach(_end_angles(circle, cone_vec, cols))
 
 

@@ -80,13 +80,7 @@ class Prism:
 
     @classmethod
     def of(cls, x: FloatArray, field: float) -> Prism:
-        """Make a prism from the numbers of a fit (6,).
-
-        Args:
-            x: in units of `field`: center, the logarithms of the diagonal of `to_disc`,
-                its other element, logarithm of the attenuation.
-            field: radius of the field of view [mm].
-        """
+        """Make a prism from a fit's numbers (6,), in units of `field` [mm]."""
         to_disc = np.array([[np.exp(x[2]), 0.0], [x[4], np.exp(x[3])]]) / field
         return cls(x[:2] * field, to_disc, float(np.exp(x[5])))
 
@@ -167,10 +161,11 @@ class Truncation:
 
     @property
     def otherwise(self) -> Truncation:
-        """The same with rows continued in another way, to see how much depends on it:
-        without prisms, fading out, if prisms explained all rows that are cut off; else by
-        the best of the prisms that do not explain the images (`others`), the rest fading
-        out over twice the length."""
+        """The same with rows continued in another way, to see how much depends on it.
+
+        That is without prisms, if they explained all rows; else by the best that do not
+        (`others`), the rest fading out over twice the length.
+        """
         if self.explained:
             return replace(self, prisms=(None,) * len(self.prisms))
         pairs = zip(self.prisms, self.others or self.prisms, strict=True)
@@ -282,13 +277,7 @@ class Continuation:
 
     @classmethod
     def empty(cls, views: int, rows: int, wide: int) -> Continuation:
-        """Make a continuation with nothing beyond the edges: all parts zero, and edge 0.
-
-        Args:
-            views: number of views.
-            rows: of the images.
-            wide: columns with those beyond the edges.
-        """
+        """Make a continuation with nothing beyond the edges: parts and edge are 0."""
         none = np.zeros(rows)
         return cls(
             0,
@@ -654,9 +643,12 @@ def _columns_of(points: FloatArray, cone_vec: ConeVec) -> FloatArray:
 def _rays(
     cone_vec: ConeVec, rows: FloatArray, columns: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute sources, horizontal rays and heights of rows [mm]. `cone_vec`: n upright panels;
-    `rows` and `columns`: (r,), (k,) counted from the panel's middle. Returns sources (n, 1, 2),
-    rays in the plane (n, k, 2), heights above the source (n, r)."""
+    """Compute rays of rows (r,) and columns (k,), counted from the middle, of upright
+    panels.
+
+    Returns sources (n, 1, 2), rays in the plane (n, k, 2), heights above the source (n,
+    r) [mm].
+    """
     panel = cone_vec.detector - cone_vec.source
     across = panel[:, None, :2] + columns[:, None] * cone_vec.u[:, None, :2]
     up = panel[:, 2, None] + rows * cone_vec.v[:, 2, None]

@@ -177,11 +177,9 @@ class CauseTable:
         return {type(kind).__name__: len(one.first) for kind, one in self.rows}
 
     def surprise(self, left: FloatArray | None = None) -> dict[str, FloatArray]:
-        """Compute how improbable the differences are: minus the logarithm of their
-        likelihood, but for a constant, kind of rows -> (ARCS,).
+        """Compute minus the log likelihood of differences by kind of rows, (ARCS,).
 
-        Args:
-            left: of the differences; all of them without.
+        `left`: of them; None: all.
         """
         ratio = np.square(self.differences if left is None else left) / self.variance
         return self._by_arcs(0.5 * (FREEDOM + 1.0) * np.log1p(ratio / FREEDOM))
@@ -229,11 +227,10 @@ class CauseTable:
         )
 
     def most_telling(self, told: list[Error]) -> Error | None:
-        """Find the error that explains most beside those that are told, of those that exceed
-        the scatter of the arcs; None without one.
+        """Find the error that explains most besides those told, beyond the arcs' scatter.
 
-        Where differences are doubtful, what sampling does to all arcs is looked at later:
-        with a large error estimates from other pixels differ because they are not linear in it.
+        Doubtful differences leave out sampling: estimates then differ as a large error is
+        not linear.
         """
         for error in self._by_gain(told):
             sampling = not self.doubtful
@@ -546,12 +543,11 @@ class Corrected:
 
 
 def rounded(size: float, sigma: float) -> tuple[str, str]:
-    """Write a size, with its sign, and its standard error with the same decimals: two digits of
-    the standard error.
+    """Write a size, with its sign, and its sigma: two digits of the latter.
 
     Example:
-        >>> rounded(-0.98712, 0.0123), rounded(1234.0, 45.6)
-        (('-0.987', '0.012'), ('+1234', '46'))
+        >>> rounded(-0.98712, 0.0123)
+        ('-0.987', '0.012')
     """
     decimals = max(0, 1 - math.floor(math.log10(sigma))) if sigma > 0.0 else 6
     return f"{size:+.{decimals}f}", f"{sigma:.{decimals}f}"

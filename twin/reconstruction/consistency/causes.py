@@ -224,10 +224,11 @@ def _gained(images: Float32Array, sizes: FloatArray) -> Float32Array:
 
 
 def _hazed(images: Float32Array, sizes: FloatArray) -> Float32Array:
-    """Compute what a constant adds that is in the beam beside the flat, or was left in by the
-    dark image: a scale of small line integrals, and a bend of large ones.
+    """Compute the change by a constant in the beam: in small integrals a scale, in large
+    a bend.
 
-    The constant is at most half of what a pixel has."""
+    It is half of a pixel at most.
+    """
     share = 0.01 * sizes[:, None, None]
     # What a pixel lacks of the open beam, over what it has.
     lacking = np.expm1(np.minimum(images, np.float32(BLACK)))

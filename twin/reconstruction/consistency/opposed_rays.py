@@ -84,13 +84,7 @@ class OpposedRays:
     def sides(
         self, images: Float32Array, first: ConeVec, second: ConeVec
     ) -> tuple[FloatArray, FloatArray]:
-        """Interpolate each ray's line integral, and that of its opposite, (m,) each.
-
-        Args:
-            images: (n, rows, cols).
-            first: n views, of the pixels.
-            second: the same, of the opposite rays.
-        """
+        """Interpolate rays' line integrals, and their opposites', (m,) each."""
         here, there, _, _ = self._sampled(images, first, second)
         return here, there
 

@@ -165,16 +165,12 @@ def _plain(cone_vec: ConeVec, mirror: FloatArray) -> FloatArray:
 
 
 def fits(image: Image, cone_vec: ConeVec, shape: tuple[int, int]) -> list[Fit]:
-    """Compare the images of a scan with every combination, the best first.
+    """Compare the images of a scan with every combination of conventions, the best first.
 
-    Two copies are compared, a coarse and a finer one, whose errors differ: a combination has the
-    larger of its odds on the two, so that what differs excludes nothing.
-
-    `image`: gives the line integrals of a view, (rows, cols), by its number; `cone_vec`: of all
-    views, the stated geometry; `shape`: (rows, cols).
-    Returns a fit of each class of combinations; [] for too few views or columns, or images
-    without an object.
-    Raises GeometryError: neither a circle nor a helix.
+    A coarse and a finer copy, whose errors differ, are compared: a combination has its
+    larger odds. `image` gives line integrals by number.
+    Returns a fit a class; [] for too few views or columns, or no object. Raises
+    GeometryError: neither a circle nor a helix.
     """
     odds: dict[frozenset[str], float] = {}
     found: list[Fit] = []
@@ -253,8 +249,10 @@ class _Shown:
         return None if made is None else made.again
 
     def right(self, rest: Float32Array) -> Float32Array | None:
-        """Return images of which this class is right, with the residual (n, rows, cols) of
-        other views as their noise; None where FDK cannot use them.
+        """Return images of which this class is right, with other views' residuals as
+        noise.
+
+        None where FDK fails.
         """
         if self.whole is None:
             return None
@@ -305,18 +303,12 @@ def _expected(
     rest: Float32Array,
     telling: npt.NDArray[np.bool_],
 ) -> FloatArray | None:
-    """Compute, in each arc, the middle of what the comparison says where the best is right
-    and where the rival is: the images speak for the best as far as they are beyond it.
+    """Compute, in each arc, the middle of what the comparison says if best or rival is
+    right.
 
-    Args:
-        best, rival: with their reprojections.
-        seen: images of which the best is right, as of its geometry; None without any.
-        rest: residual of the best, (n, rows, cols).
-        telling: measures that count, (2,).
-
-    Returns:
-        None where the comparison says no more for the best where that is right, or FDK
-        cannot use what it needs.
+    Images speak for the best as far as they are beyond it. `seen`: images of which the
+    best is right; `rest`: its residual, (n, rows, cols); `telling`: measures that count,
+    (2,). Returns None where it says no more if the best is right, or FDK fails.
     """
     theirs = rival.right(rest)
     if seen is None or theirs is None:

@@ -128,19 +128,12 @@ Views = Callable[[int], Iterable[Float32Array]]
 
 
 def bad_pixels(views: Views, axis_column: float) -> BadPixels | None:
-    """Find pixels that do not respond as their neighbors do: dead, hot or flickering.
+    """Find pixels that do not respond as their neighbors: dead, hot or flickering.
 
-    Pixels that a feature of the object may explain are left out.
-
-    Args:
-        views: gives line integrals of a scan; called for `SCREENED_VIEWS` of them and,
-            where there may be bad pixels, once more for these, as the worst make their
-            neighbors look bad as well, and once for `JUDGED_VIEWS`.
-        axis_column: where the axis falls.
-
-    Returns:
-        None if no pixel is bad, or more than `MAX_BAD_SHARE` may be: such images are of
-        another kind.
+    Not those that an object's feature may explain. `views` gives line integrals; called
+    for `SCREENED_VIEWS`, again with the worst mended, as they make neighbors look bad,
+    and for `JUDGED_VIEWS`. Returns None without bad pixels, or with more than
+    `MAX_BAD_SHARE`: other images.
     """
     first, response = _outliers(views(SCREENED_VIEWS), axis_column)
     if not first.any():
@@ -509,11 +502,11 @@ class _Judged:
         return alike
 
     def _chance_of_pairs(self, many: int, paired: int, share: float = 1.0) -> float:
-        """Compute the probability that of pixels scattered over the panel so many have
-        counterparts (Poisson).
+        """Compute the probability that `paired` of `many` scattered pixels are pairs
+        (Poisson).
 
-        `many`: number of pixels; `paired`: number of those with a counterpart, or more, in a
-        part of the panel; `share`: of the panel's pixels in that part."""
+        They are in a `share` of the panel's pixels.
+        """
         from scipy.special import gammainc
 
         reached = 2 * AXIS_REACH_PX + 1

@@ -93,15 +93,9 @@ class Reprojection:
         return cls(images, values, again, noise, float(rows.mean()), own_noise)
 
     def misfit(self, least: float = MIN_SIGNAL_SHARE) -> FloatArray:
-        """Compute the root mean square of the residual, less noise, over that of the
-        images.
+        """Compute the rms residual, less noise, over the images', (2,).
 
-        Args:
-            least: share of the residual's mean square that is kept whatever the noise.
-
-        Returns:
-            (2,): of the values, and of their changes along rows, which scatter and beam
-            hardening hardly alter.
+        Of values, and of changes along rows. `least` of its square always stays.
         """
         residual, signal, noise = self._powers
         beside = np.maximum(residual - noise, least * residual)
@@ -161,15 +155,9 @@ class Reprojection:
 
 
 def layers_off(scan: CoarseScan, cone_vec: ConeVec) -> float:
-    """Compute by how much the object has to be raised so that a geometry's rows fall on the
-    grid's layers as those of the scan do [layers, at most 0.5 up or down].
+    """Compute how far to raise the object so that rows fall on layers, as the scan's.
 
-    Else a panel that is moved along columns by half a row leaves up to two fifths less of
-    fine parts' residual, whatever the object.
-
-    Args:
-        scan: gives the grid and the stated geometry.
-        cone_vec: n views.
+    Else a panel half a row off leaves less residual. [layers, to 0.5]
     """
     fall = scan.cone_vec.v[:, 2]
     rows = float(((cone_vec.detector - scan.cone_vec.detector)[:, 2] / fall).mean())

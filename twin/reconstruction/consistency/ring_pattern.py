@@ -52,17 +52,14 @@ def ring_errors(
     axis_column: float | None = None,
     width: int = NEIGHBOURHOOD_COLS,
 ) -> Float32Array:
-    """Find each pixel's constant error, to be subtracted from all views.
+    """Find each pixel's constant error, to be subtracted from all views, (rows, cols).
 
-    Pixels and complete columns (means over `COLUMN_ROWS` rows) are judged separately; a pattern
-    shared by the rows above and below, or by the other side of the axis, is the object's.
-    `views`: (rows, cols) line integrals of all views, in order. `axis_column`: where the axis
-    falls, of a full turn; None where columns on both sides of it do not see the same rays: then
-    complete columns are left unchanged. `width`: columns of the neighborhood; made odd, 3 at
-    least.
-    Returns (rows, cols); 0 where nothing stands out from object and noise, and everywhere with
-    fewer than `MIN_GROUPS` groups of `GROUP_VIEWS` views.
-    Raises LimitError: no views."""
+    Pixels and complete columns (means over `COLUMN_ROWS` rows) are judged separately;
+    what the rows beside, or the other side of the axis, share is the object's.
+    `axis_column` is None if the sides do not see the same rays: columns then stay.
+    `width`: columns of the neighborhood. Returns 0 where nothing stands out, or groups of
+    views are too few. Raises LimitError: no views.
+    """
     groups = _group_medians(views, width)
     if len(groups) < MIN_GROUPS:
         return np.zeros_like(groups[0])
@@ -205,11 +202,11 @@ def _columns_seen_twice(cols: int, axis_column: float) -> npt.NDArray[np.bool_]:
 
 
 def _other_side(values: Float32Array, axis_column: float) -> Float32Array:
-    """Return values of the columns as far from the axis on the other side, 0 off the panel.
+    """Return values (rows, cols) of the columns across the axis, 0 off the panel.
 
-    The center of symmetry is the one within `AXIS_REACH_PX` of the stated axis, in half columns,
-    at which both sides correlate best.
-    `values`: (rows, cols); `axis_column`: the stated axis [px]."""
+    The center of symmetry is the one within `AXIS_REACH_PX` of the stated axis at which
+    both sides correlate best.
+    """
     stated = round(2.0 * axis_column)
     reach = range(stated - 2 * AXIS_REACH_PX, stated + 2 * AXIS_REACH_PX + 1)
     mirrored = [_mirrored(values, total) for total in reach]

@@ -316,11 +316,12 @@ def _interpolated(
 
 
 def sampling_error(images: Float32Array, noise: float) -> FloatArray:
-    """Compute by how much pixels may be off because they stand for what is between them: a jump
-    between two pixels, which bends both, is off by `ROUNDING` in one of them.
+    """Compute standard deviations (n, rows, cols) of pixels that stand for what lies
+    between.
 
-    `images`: (n, rows, cols); `noise`: variance of a pixel, whose second differences are no
-    bends. Returns standard deviations (n, rows, cols)."""
+    A jump bends two pixels, one off by `ROUNDING`. `noise`: a pixel's variance, which
+    bends without jumps.
+    """
     squares = np.zeros(images.shape)
     squares[:, :, 1:-1] += np.square(np.diff(images, n=2, axis=2)) - 6.0 * noise
     if images.shape[1] > 2:

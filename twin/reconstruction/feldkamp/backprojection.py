@@ -370,10 +370,11 @@ class OnDevice:
         return ready
 
     def _ready(self, n: int, cols: int, rows: int) -> Any:
-        """Reserve device memory for filtered columns, with undefined content. One piece of
-        memory is shared by all calls, and replaced by a larger one where too small; each call
-        thus overwrites the result of the one before. Returns float32 (n, cols, rows) on the
-        device."""
+        """Reserve device memory (n, cols, rows) for filtered columns, with undefined
+        content.
+
+        All calls share one piece, so each overwrites the result before.
+        """
         from numba import cuda
 
         if self._room is None or self._room.size < n * cols * rows:

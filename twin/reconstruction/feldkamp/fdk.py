@@ -108,32 +108,12 @@ def fdk_parts(
     outside: bool = False,
     errors: bool = False,
 ) -> Volume:
-    """Reconstruct as `fdk` from views that come in parts, in order, without warnings.
+    """Reconstruct as `fdk` from views in parts, in order, without warnings.
 
-    Works on a device, slab by slab, if there is one with room, no target is given and the
-    scan is a circle; if the device fails, from the beginning on the processor.
-
-    Args:
-        parts: gives float32 (k, rows, cols) arrays of line integrals, together one image
-            a view; called again if a device fails on the way, and for each slab of a
-            volume that it has no room for.
-        cone_vec: of all views.
-        shape: detector (rows, cols).
-        like: the grid, or a volume on it.
-        window: of the ramp filter.
-        progress: called with the fraction done.
-        truncation: object beyond the panel's edges (`truncation_of`); None for nothing.
-        target: adds the views up, and may be read meanwhile; None for a new one.
-        outside: keep the values that continued rows give to voxels of a wide object that
-            are not seen from all sides, instead of NaN.
-        errors: give the volume its `sigma` (of circles).
-
-    Returns:
-        The volume (nz, ny, nx) [1/mm], NaN where too few views see a voxel.
-
-    Raises:
-        GeometryError: see `plan_fdk`; or images that do not fit.
-        UnknownNameError: no such window.
+    A circle goes to a device with room unless a target is given; if that fails, from the
+    beginning on the processor. `parts` gives line integrals (k, rows, cols), and may be
+    called again. `outside` keeps what continued rows give where not all sides are seen.
+    Raises GeometryError: `plan_fdk`, or other images; UnknownNameError: no such window.
     """
     like = as_volume(like)
     task = Task(parts, cone_vec, shape, window, truncation, outside, errors)
@@ -185,13 +165,10 @@ def _add_all(
     target: Backprojector,
     progress: Progress | None,
 ) -> None:
-    """Add the images of all views to a volume, part by part.
+    """Add the images of all views, (k, rows, cols) a part, to a volume.
 
-    `plan`: views, weights and filter. `parts`: the images in order, (k, rows, cols) each.
-    `target`: the volume. `progress`: called after each part with the share of the views that is
-    done; None for nothing.
-    Raises GeometryError: images of another shape, or another number of them; gpu.DeviceError:
-    the target is a device, and failed.
+    `progress` gets the share done. Raises GeometryError: another shape or number of
+    images; gpu.DeviceError: the device failed.
     """
     done = 0
     for part in parts:
@@ -205,11 +182,9 @@ def _add_all(
 
 
 def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:
-    """List layers (first, last) of the slabs that fit the device one by one: the number of slabs
-    is doubled until one fits.
+    """List layers (first, last) of slabs that fit the device, doubling their number.
 
-    `like`: the complete grid; `shape`: (rows, cols) of the images.
-    Returns empty without a device, or if not even one layer fits.
+    Empty without a device, or if not even one layer of the grid fits.
     """
     count = 1
     most = like.shape[0]

@@ -88,15 +88,9 @@ def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
 
 
 def taps(response: Float32Array, wide: int, more: int) -> FloatArray:
-    """Compute the filter in space, by the distance in columns.
+    """Compute the filter in space by distances of columns, then zeros, (wide + more,).
 
-    Args:
-        response: of `ramp`.
-        wide: number of distances from 0 on.
-        more: zeros after them.
-
-    Returns:
-        (wide + more,); 0 at distances beyond the padded length.
+    It is 0 beyond the padded length.
     """
     values = np.fft.irfft(response.astype(np.float64), padded_length(response))[:wide]
     return np.pad(values, (0, wide - len(values) + more))
@@ -108,14 +102,8 @@ def shortened(response: Float32Array, reach: int) -> Float32Array:
 
 
 def response_of_length(response: Float32Array, length: int) -> FloatArray:
-    """Compute the response of the same filter on rows padded to another length, (length / 2 +
+    """Compute the same filter's response on rows of another even length, (length / 2 +
     1,).
-
-    Columns are right as far as both lengths allow: half of the shorter one.
-
-    Args:
-        response: of `ramp`.
-        length: of a padded row [columns], even.
     """
     half = taps(response, length // 2 + 1, 0)
     return np.asarray(np.fft.rfft(np.concatenate([half, half[-2:0:-1]])).real)

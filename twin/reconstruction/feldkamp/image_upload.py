@@ -83,9 +83,8 @@ class ImageUpload:
     def table(self, name: str, values: FloatArray | Float32Array) -> Any:
         """Upload a table as single precision, without waiting.
 
-        Tables of one name share their memory, which is overwritten by the chunk after the next.
-        `name`: of the table; `values`: of any shape.
-        Returns of the same shape, on the device."""
+        Tables of one name share memory, which the chunk after the next overwrites.
+        """
         there = self._room(name, values.shape)
         portion = self._portion(values.size).reshape(values.shape)
         np.copyto(portion, values, casting="same_kind")

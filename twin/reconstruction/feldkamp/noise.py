@@ -73,13 +73,12 @@ class Noise:
     shared: FloatArray
 
     def sigma(self, grid: Volume) -> Float32Array:
-        """Compute the standard deviation of noise at each voxel of a grid, (nz, ny, nx)
-        [1/mm]; NaN where the grid's values are.
+        """Compute the standard deviation of noise at a grid's voxels [1/mm]; NaN where it
+        is.
 
-        It is the root of the interpolated variance of the views' own noise plus that
-        common to all views, by the distance from the rotation axis. It is a mean over where
-        voxels lie between two rows of the panel: near the axis one on a row has up to 1.2
-        times as much, one between two rows .85 times.
+        The views' own variance, interpolated, plus what they share by distance from the
+        axis. A mean over rows: near the axis one on a row has 1.2 times as much, between
+        two .85.
         """
         x, y, _ = grid.centers()
         flat = np.hypot(x - self.centre[0], (y - self.centre[1])[:, None])

@@ -144,11 +144,10 @@ def beam_problems(plan: ScanPlan) -> Findings:
 
 
 def _aggregate(view: View, bad: BoolArray, code: ScriptCode, text: str) -> Finding:
-    """Make one warning for all `bad` images of a view, at the first of their lines.
+    """Make one warning for all `bad` images (n,) of a view, at the first of their lines.
 
-    The text ends with the number of further lines, if there are any.
-    `view`: with the line of each image. `bad`: (n,) which images; at least one. `code`: of the
-    warning. `text`: of the warning."""
+    The text ends with the number of further lines, if any.
+    """
     lines = sorted({line for line, b in zip(view.lines, bad.tolist(), strict=True) if b})
     more = ""
     if len(lines) > 1:
@@ -252,12 +251,10 @@ def _tangents(p: Poses, radius: float) -> list[FloatArray]:
 
 
 def _rims(p: Poses, rims_mm: Sequence[tuple[float, float]]) -> list[FloatArray]:
-    """Compute the points of circles about the rotation axis nearest to and farthest from the
+    """Compute the points of circles about the axis nearest to and farthest from the
     source.
 
-    `p`: n poses; `rims_mm`: (radius, height) of each circle, height above the axis's origin
-    [mm].
-    Returns for each circle the nearest and the farthest point, (n, 3) [mm].
+    `rims_mm`: (radius, height above the axis's origin). Returns (n, 3) [mm] each.
     """
     along = (p.source - p.axis)[:, :2]
     along = along / np.linalg.norm(along, axis=1, keepdims=True)

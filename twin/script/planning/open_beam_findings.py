@@ -34,14 +34,10 @@ Setting = tuple[ExposureSettings, CameraSettings]
 
 
 def open_beam_problems(plan: ScanPlan, physics: Physics = "poly") -> Findings:
-    """Warn once for each setting of tube and camera whose open beam is saturated or starved.
+    """Warn of each setting of tube and camera whose open beam is saturated or starved.
 
-    Settings whose beam the physics cannot predict, or with X-rays off, get no warning.
-
-    `plan`: with the saved images, their settings and positions; `physics`: how counts are
-    predicted.
-    Returns warnings `saturated_open_beam` and `starved_open_beam`, each with an exposure that
-    would do, at the first line that uses the setting.
+    At the first line that uses it, with an exposure that would do. Settings whose beam is
+    not predicted, or with X-rays off, get no warning.
     """
     problems: list[Finding] = []
     for (exposure, camera), (line, indices) in lit_settings(plan).items():
@@ -89,12 +85,9 @@ def brightest_beam(
     indices: list[int],
     physics: Physics,
 ) -> OpenBeam | None:
-    """Predict the brightest open beam of some images of a setting.
+    """Predict the open beam of most counts among images of a setting, None if none is.
 
-    It is the one with the most counts among at most `SAMPLED_IMAGES` of them.
-    `plan`: with the positions; `exposure`: of the setting; `camera`: of the setting; `indices`:
-    of the images, at least one; `physics`: how counts are predicted.
-    Returns the beam; None if the physics cannot predict it.
+    `indices`: of the images; `SAMPLED_IMAGES` of them are tried.
     """
     beams = [
         beam

@@ -195,15 +195,11 @@ class SampleSize:
         source: str = "given",
         offset: StagePlacement | None = None,
     ) -> SampleSize:
-        """Make the cylinder about the rotation axis that contains a box on the stage, at
-        every angle.
+        """Make the cylinder about the rotation axis that contains a box [mm] at every
+        angle.
 
-        A box that is tilted about x or y counts as its enclosing sphere.
-
-        Args:
-            size_mm: of the box, x, y, z [mm].
-            source: of the size, for people.
-            offset: placement of the box; None: upright in the middle of the stage.
+        A box tilted about x or y counts as its sphere. `offset`: None: upright in the
+        stage's middle; `source`: of the size, for people.
         """
         if offset is None:
             at = StagePlacement()
@@ -218,11 +214,11 @@ class SampleSize:
 
     @classmethod
     def of_points(cls, points_mm: FloatArray, source: str = "given") -> SampleSize:
-        """Make the cylinder, and the rims, that contain points at every angle.
+        """Make the cylinder, and rims, that contain points (k, 3) [mm] at every angle.
 
-        The cylinder is as high above the stage's origin as below it.
-        `points_mm`: (k, 3) in the object frame, k > 0: corners of the sample's shape, as it
-        stands on the stage; `source`: of the size, for people."""
+        It is as high above the stage's origin as below it. `source`: of the size, for
+        people.
+        """
         radius = np.hypot(points_mm[:, 0], points_mm[:, 1])
         height = points_mm[:, 2]
         diameter_mm = 2.0 * float(radius.max())

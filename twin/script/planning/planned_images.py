@@ -69,22 +69,12 @@ def infer(
 ) -> Inference | None:
     """Infer averages, then frames, then the increment from speed and run-up.
 
-    The scan's length is the motion's less one run-up at each end (the end is symmetric),
-    rounded to whole turns for a rotation. Averages follow from frames where those are
-    stated, else from the run-up. `frames x speed x period` within half a step of full
-    turns means that the images are at turn / (frames - 1), as the scanner's own software
-    counts; otherwise they are where the motor is.
-
-    Args:
-        trigger: the move that waited for a position.
-        exposure_s: of one image [s].
-        frames: stated number of frames, or None.
-        averages: stated number of averages, or None.
-
-    Returns:
-        The inferred values, with a note on each one that was not stated. None if averages
-        do not follow (`_averages`), or the scan has less than half a step or
-        `MAX_INFERRED_STEPS` steps or more.
+    The scan's length is the motion's less a run-up at each end, rounded to whole turns.
+    Averages follow from frames, else from the run-up. `frames x speed x period` within
+    half a step of full turns means images at turn / (frames - 1), as the scanner's own
+    software counts; otherwise they are where the motor is.
+    Returns notes on what was not stated, too; None if averages do not follow, or steps
+    are less than half or `MAX_INFERRED_STEPS` or more.
     """
     length = _length(trigger)
     rotation = trigger.unit == "deg"
@@ -109,19 +99,10 @@ def infer(
 
 
 def images(step: float, frames: int, rotation: bool) -> tuple[float, float]:
-    """Compute the increment between the images of a scan, and its mismatch.
+    """Compute the increment between a scan's images, and its mismatch [mm, deg].
 
-    A rotation within half a step of whole turns (one or more) is divided into frames - 1
-    equal increments; the mismatch is by how much the steps exceed the turns. Else the
-    increment is `step`, and the mismatch 0.
-
-    Args:
-        step: motion from image to image [mm, deg].
-        frames: number of images.
-        rotation: whether the axis turns.
-
-    Returns:
-        (increment, mismatch over the scan) [mm, deg].
+    A rotation within half a step of whole turns is divided equally; the mismatch is by
+    how much steps exceed turns. Else it is `step`, and 0.
     """
     scan = step * (frames - 1)
     turns = round(scan / FULL_TURN_DEG)
@@ -146,20 +127,12 @@ def _length(trigger: planned.Trigger) -> float:
 def _averages(
     trigger: planned.Trigger, exposure_s: float, frames: int | None, length: float
 ) -> tuple[int, str] | None:
-    """Infer the number of averages, and how.
+    """Infer the number of averages, an image's period over its exposure, and how.
 
-    It is the period of an image over its exposure. The period is the length over the steps and
-    the speed or, with fewer than two frames or no length, the run-up less the way to full speed,
-    over `MARGIN_IMAGES` and the speed.
-
-    Args:
-        trigger: of the sequence, with its motion.
-        exposure_s: of one read-out [s].
-        frames: number of images, if it is known.
-        length: of the motion [mm, deg].
-
-    Returns the number of averages, and the figures that it follows from; None if that is below
-    1, or not a whole number within 2 %.
+    The period is the length over steps and speed or, with fewer than two frames or no
+    length, the run-up less the way to full speed, over `MARGIN_IMAGES` and the speed.
+    `length` of motion is in mm or deg. Returns None for less than 1, or no whole number
+    within 2 %.
     """
     speed = trigger.speed
     acceleration = trigger.acceleration
@@ -225,10 +198,11 @@ class ImageCollector:
     # commands ------------------------------------------------------------------------------
 
     def take(self, command: c.TakeImage, now: float, step: int) -> planned.Span:
-        """Simulate `take image`: add one image, not saved yet; the number of frames is for
-        sequences. The camera is busy for the exposure times the averages, and the command's
-        overhead. `command`: without arguments; `now`: moment of the script [s]; `step`: index of
-        the command's step. Returns the time that the command takes."""
+        """Simulate `take image`: add one image, not saved yet; frames are for sequences.
+
+        The camera is busy for exposure times averages, and the overhead. `step`: the
+        command's.
+        """
         self._add_images(np.array([now], dtype=np.float64), now, step, command.line)
         settings = self.camera.settings
         length = settings.exposure_ms * settings.averages / 1000.0
@@ -345,23 +319,11 @@ class ImageCollector:
         files: tuple[str, ...] = (),
         exact: Mapping[str, FloatArray] | None = None,
     ) -> ExposureGroup:
-        """Add images taken from `start` on with the settings in force, and remember them
-        as the last.
+        """Add images with exposures from `starts` (n,) [s], and remember them as the
+        last.
 
-        X-rays and motion are those of `start`, for all of the images; the motors under
-        way then are remembered in `moved`.
-
-        Args:
-            starts: of the exposures, (n,) [s].
-            start: of the command [s].
-            step: index of the command's step.
-            line: of the script.
-            kind: of the images.
-            files: their names; empty until they are saved.
-            exact: axis -> positions (n,), where these are known better than by time.
-
-        Returns:
-            The group of images.
+        X-rays and motion are those at `start`, the command's; motors under way are kept
+        in `moved`. `exact`: axis -> positions (n,) better known than by time.
         """
         tube = self.tube
         self.moved = self.motors.moving(start)
@@ -569,11 +531,9 @@ class ImageCollector:
             self._default("power_W", "the tube power", f"{draft.power_W:g} W")
 
     def _default(self, name: str, what: str, value: str) -> None:
-        """Warn, once, that the script states no value of setting `name`; `value` of the machine
-        file is assumed. Do nothing if it is stated.
+        """Warn, once, that no value of setting `name` is stated, and `value` is assumed.
 
-        `name`: of the setting; `what`: the setting in words, for the message; `value`: with its
-        unit, for the message.
+        `what`: the setting in words; nothing is done if it is stated.
         """
         if name not in self.camera.said | self.tube.said | self._reported:
             self._reported.add(name)

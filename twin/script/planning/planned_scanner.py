@@ -84,13 +84,10 @@ class Motor:
     def move(
         self, target: float, time: float, speed: float, acceleration: float
     ) -> Trajectory:
-        """Start a move to `target` at `time`, from the position and velocity of that moment.
+        """Start a move to `target` at `time`, from the position and velocity then.
 
-        A move that is under way is replaced from then on.
-
-        `target`: position at rest [mm, deg]; `time`: of the command [s]; `speed` and
-        `acceleration`: of the move [per s, per s2].
-        Returns the trajectory; it is recorded unless it takes no time.
+        It replaces one under way; it is recorded unless it takes no time. Units are mm or
+        deg, and s.
         """
         v = 0.0
         if self.moves:
@@ -182,9 +179,7 @@ class PlannedTube:
         self.since = time
 
     def switch(self, on: bool, time: float) -> None:
-        """Turn X-rays on or off at `time` [s]; the beam until then is recorded, the state
-        now known.
-        """
+        """Turn X-rays on or off at `time` [s]; the beam until then is recorded."""
         self._close(time)
         self.on = on
         self.known = True

@@ -92,19 +92,10 @@ def plan_script(
 def simulated(
     commands: tuple[c.Command, ...], machine: Machine, start: StartState
 ) -> Simulation:
-    """Run commands on a virtual clock: steps, motion and images, without the beam's view.
+    """Run commands on a virtual clock: steps, motion, images, without the beam's view.
 
-    If averages are inferred from a scan, the commands run a second time with them,
-    because they apply to the images before the scan as well.
-
-    Args:
-        commands: of the script, in order.
-        machine: whose axes, limits, camera and timing these are.
-        start: the scanner before the script.
-
-    Returns:
-        The simulation at its end, with steps, images and findings; nothing is raised for
-        problems of the script.
+    Averages inferred from a scan apply to the images before it, too: then the commands
+    run again. Problems are in its findings.
     """
     simulation = Simulation(machine, start)
     simulation.run(commands)

@@ -172,9 +172,10 @@ def _image(file: str, line: int = 0) -> list[c.Command]:
 
 
 def _moves(pose: Pose, line: int = 0) -> list[c.Command]:
-    """Make the commands that move all axes of a pose together and wait for each. Of several axes
-    each is first sent without waiting, then again with an acknowledgement; a single one is sent
-    once, and no axis gives []. `pose`: axis -> position [mm, deg]; `line`: of the commands."""
+    """Make the commands that move a pose's axes [mm, deg] together and wait for each.
+
+    Of several, each is first sent without waiting, then again.
+    """
     moves = [
         c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()
     ]
@@ -196,10 +197,10 @@ def _arrival(
 
 
 def _legs(start: Pose, end: Pose, route: Route | None = None) -> Sequence[Pose] | None:
-    """List the moves between two poses: those of `route`, or all motors at once. Only motors
-    whose position changes move. `start` and `end`: motor -> position [mm, deg]. `route`: finds a
-    free path; None: the direct one, whether free or not. Returns moves in order, [] where
-    nothing changes; None if the route finds none."""
+    """List the moves [mm, deg] between two poses, of changed motors only.
+
+    By `route`, or all at once; None if the route finds none.
+    """
     goal = {axis: value for axis, value in end.items() if value != start[axis]}
     if route is None:
         return [goal] if goal else []

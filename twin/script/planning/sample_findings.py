@@ -109,11 +109,9 @@ def sample_probes(plan: ScanPlan) -> tuple[SampleProbe, ...]:
 def shares_behind(
     chain: Chain, probe: SampleProbe, paths_mm: Float32Array, rows: FloatArray
 ) -> CountShares:
-    """Count the saturated and the starved pixels of a probe's views, as shares of all pixels.
+    """Compute the shares of saturated and starved pixels in a probe's views.
 
-    `chain`: tube, materials of the sample, panel; `probe`: the views; `paths_mm`: path through
-    each material along its rays, float32 (m, n, rows, cols) [mm]; `rows`: cone_vec of the views,
-    (n, 12).
+    `paths_mm`: through each material, (m, n, rows, cols); `rows`: cone_vec, (n, 12).
     """
     counts = [
         counts_behind(
@@ -129,10 +127,8 @@ def predicted_exposures(
 ) -> tuple[PredictedExposure, ...]:
     """Predict each setting of a plan's projections, with what speaks against it.
 
-    `plan`: that the forecast is of; `forecast`: of the pixels behind the sample; `physics`: how
-    counts are made.
-    Returns one for each probe of the forecast, in its order. Where pixels behind the sample are
-    not predicted it has the forecast's reason.
+    In order of the forecast's probes; those without pixels behind the sample have its
+    reason.
     """
     made = [
         _predicted(plan, probe, seen, physics)

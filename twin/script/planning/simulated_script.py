@@ -51,11 +51,9 @@ _CAMERA: Final = (c.CameraSetting, c.TakeImage, c.SaveImage, c.TakeSequence)
 
 
 def sample_size(data: bytes) -> SampleSize | None:
-    """Decode the sample's diameter from the argument of `set sample info`.
+    """Decode the sample's diameter, a big-endian double [mm], of `set sample info`.
 
-    `data`: a big-endian double [mm] at its beginning.
-    Returns the size, without a height. None for less than 12 bytes, or a diameter that is not
-    above 0 and at most `_MAX_DIAMETER_MM`.
+    None for less than 12 bytes, or not within 0 to `_MAX_DIAMETER_MM`.
     """
     if len(data) < 12:
         return None
@@ -169,10 +167,10 @@ class Simulation:
                 assert_never(command.wait)
 
     def timed(self, kind: str, length: float = 0.0, note: str = "") -> planned.Span:
-        """Make the span of a command that starts now: its length and the machine's time for its
-        kind. The script's own expected duration (column 7) is no prediction but a bound. `kind`:
-        of command, as in `Timing`; `length`: of motion, pause or exposures [s]; `note`: added to
-        the step's description."""
+        """Make the span of a command from now: its length [s] and its kind's time.
+
+        The script's own expected duration is only a bound.
+        """
         overhead = self.machine.timing.seconds(kind)
         return planned.Span(
             self.now, self.now + length + overhead, overhead, kind, note=note
@@ -229,9 +227,7 @@ class Simulation:
     def _xray_on(self, _command: c.XrayOn) -> planned.Span:
         """Switch X-rays on at the end of the command, and set when they are ready.
 
-        If they are on already nothing changes, and the command takes the time of any other.
-
-        Returns the time that the command takes; X-rays are ready later.
+        If on already, it takes the time of any command.
         """
         if self.tube.on:
             return self.timed("command", note=" (already on)")

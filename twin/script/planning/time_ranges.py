@@ -19,9 +19,10 @@ class _OfKind(Protocol):
 
 
 def step_range(step: PlanStep, timing: Timing) -> Range | None:
-    """Compute (5 %, 95 %) of how long the script waits for a step [s], at least 0. A time that
-    is only assumed, on a machine whose other times are measured, is taken as anything from
-    nothing to twice itself. Returns the range; None where no time of the machine is measured."""
+    """Compute (5 %, 95 %) of how long the script waits for a step [s].
+
+    None if no time of the machine is measured.
+    """
     if not timing.spread:
         return None
     below, above = _margins(step.kind, timing)

@@ -60,13 +60,11 @@ def read_data_exchange(
     distances: tuple[float, float] | None = None,
     angles: FloatArray | None = None,
 ) -> DataSet:
-    """Read a Data Exchange file into memory; the file is closed again.
+    """Read a Data Exchange file into memory.
 
-    `path`: the file; `geometry`: one view for each projection, in place of the file's;
-    `distances`: source to axis and to panel [mm], in place of the file's; `angles`: of the
-    projections [deg], where the file has none.
-    Raises DatasetFormatError: no images, or no geometry that is possible; TwinError: the package
-    h5py is not installed.
+    In place of the file's: `geometry`, one view a projection; `distances` to axis and
+    panel [mm]; `angles` [deg], where it has none. Raises DatasetFormatError: no images,
+    or no possible geometry; TwinError: h5py is missing.
     """
     with hdf5_file(path, "Data Exchange") as file:
         said = Ledger(DATA_EXCHANGE, str(path))

@@ -120,11 +120,10 @@ def unit_of(dataset: Any, usual: str) -> str:
 def _scale(
     dataset: Any, usual: str, known: Callable[[str], float | None], names: str
 ) -> float:
-    """Return the size of the unit that a dataset states.
+    """Return the size of the unit that a dataset states (`usual`: without one).
 
-    `dataset`: with or without a unit; `usual`: unit of one without; `known`: gives the size of a
-    unit, None of an unknown one; `names`: of known units, for the message.
-    Raises DatasetFormatError: the unit is unknown.
+    `names`: of known ones, for the message. Raises DatasetFormatError: the unit is
+    unknown.
     """
     unit = unit_of(dataset, usual)
     scale = known(unit)

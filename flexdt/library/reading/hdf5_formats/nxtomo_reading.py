@@ -41,14 +41,12 @@ def read_nxtomo(
     distances: tuple[float, float] | None = None,
     angles: FloatArray | None = None,
 ) -> DataSet:
-    """Read an NXtomo file into memory; the file is closed again.
+    """Read an NXtomo file into memory.
 
-    `path`: the file. `geometry`: one view for each projection; None: the rows of cone_vec in the
-    file, or its angles, pixels and distances. `distances`: source to axis and to panel [mm], in
-    place of the file's; ignored where `geometry` or the file's cone_vec is used. `angles`: of
-    the projections [deg], where the file has none.
-    Raises DatasetFormatError: no HDF5, no NXtomo, missing images, no geometry, or one that the
-    file's own figures contradict; TwinError: the package h5py is not installed.
+    In place of its own: `geometry`, one view a projection; else `distances` to axis and
+    panel [mm], unless it has cone_vec; `angles` [deg], where it has none. Raises
+    DatasetFormatError: no NXtomo, images or geometry, or contradictions; TwinError: h5py
+    is missing.
     """
     try:
         with hdf5_file(path, "NXtomo") as file:

@@ -43,22 +43,18 @@ SAME_AXIS_PX: Final = 0.01
 
 
 def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
-    """Read a scan of Nikon's; its images stay in their files.
+    """Read a scan of Nikon's (.xtekct); its images stay in `InputFolderName`.
 
-    They are in `InputFolderName`, beside the file by default. The axis is placed and
-    leant as the file's object offset, roll and tilt, or else CentreOfRotation, state. The
-    white level of the file serves as flat image, the dark one is zero. Angles measured for
-    each view, in `_ctdata.txt` or the `.ang` file, come before `AngularStep`.
+    The axis is placed as the object's offset, roll and tilt, or CentreOfRotation, state.
+    The white level serves as flat image, the dark one is zero. Measured angles
+    (`_ctdata.txt`, `.ang`) come before `AngularStep`.
 
-    Args:
-        path: the .xtekct file.
-        geometry: one view for each projection, in place of the file's; the file must
-            state its numbers all the same, but impossible distances are no error then.
+    `geometry`: in place of the file's, which must state its numbers all the same.
 
     Raises:
-        DatasetError: the file lacks a number or states two, has impossible distances, no
-            open beam or not 1 to a million projections; or images are missing or of
-            another shape than it states.
+        DatasetError: the file lacks a number, states two or impossible distances, no open
+            beam or not 1 to a million projections; or images are missing or of another
+            shape.
     """
     said = Ledger(NIKON, str(path))
     values = ini_values(head_text(path))

@@ -123,10 +123,9 @@ def compared(
     pitch: float,
     angles_deg: np.ndarray,
 ) -> None:
-    """Set the figures of a file aside for a given geometry, and tell where they differ.
+    """Set a file's figures aside for a given geometry, and tell where they differ.
 
-    `said`: by the file; `given`: geometry in its place; `pitch`: of columns in the file
-    [mm]; `angles_deg`: of views in the file.
+    `pitch`: of columns [mm]; `angles_deg`: of views.
     """
     said.give((GEOMETRY, ANGLES), "geometry=")
     for found in (
@@ -244,11 +243,7 @@ def under_a_level(
 
 
 def stated_voltage(said: Ledger, name: str) -> ScanSettings | None:
-    """Take the tube's voltage [kV], which `material=` of reconstruct needs.
-
-    `said`: what the file states; `name`: of its field.
-    Returns settings with it alone; None where it is missing or no number above 0.
-    """
+    """Take the tube's voltage [kV] from a field; None if it is no number above 0."""
     value = as_number(said.stated(name) or "")
     if not 0.0 < value < math.inf:
         return None
