@@ -120,14 +120,9 @@ def chain_through(
     tube: TubeModel,
     mono_keV: float | None = None,
 ) -> Chain:
-    """Make the chain from the paths through these materials to
-    counts, see `flexdt.twin.physics`.
+    """Make the chain from the paths through these materials to counts.
 
-    Args:
-        parts: from `channels`.
-        panel: the detector.
-        tube: the source.
-        mono_keV: energy of all photons [keV]; None for the full spectrum.
+    `parts`: of `channels`. `mono_keV`: of all photons; None: the full spectrum.
     """
     return Chain(
         panel,
@@ -195,9 +190,9 @@ def line_integrals(
 
 
 def _exact(surface: Surface) -> TriangleMesh | None:
-    """Convert the surface to a mesh with exact paths, in which bodies that overlap are united.
+    """Convert the surface to an exact mesh, overlapping bodies united.
 
-    None where its triangles do not share their corners, or where it meets itself.
+    None if open, or if it meets itself.
     """
     try:
         return united(TriangleMesh(surface.vertices, surface.faces.astype(np.int64)))
@@ -206,12 +201,10 @@ def _exact(surface: Surface) -> TriangleMesh | None:
 
 
 def _mesh(phantom: Phantom, surface: Surface, made_of: Material) -> Body:
-    """Convert a surface to the body of its material, 1 where it has the material's own density.
+    """Convert a surface to the body of its material, 1 where it has its own density.
 
-    `phantom`: gives size and voxel of the grid; `surface`: triangles with their attenuation;
-    `made_of`: the material.
-    Returns a mesh; voxels of the amount where the mesh is not exact, or the surface's
-    attenuation differs from the material's by more than `ATTENUATION_TOLERANCE` of it.
+    Returns voxels where the mesh is not exact, or its attenuation differs from the
+    material's by more than `ATTENUATION_TOLERANCE` of it.
     """
     mesh = _exact(surface)
     if (
@@ -224,10 +217,7 @@ def _mesh(phantom: Phantom, surface: Surface, made_of: Material) -> Body:
 
 
 def _find(name: str) -> Material | None:
-    """Look up a material by its name or FORMULA@DENSITY; None if that name is unknown.
-
-    A formula that cannot be parsed raises LimitError.
-    """
+    """Look up a material; None if it is unknown."""
     try:
         return material(name)
     except UnknownNameError:
@@ -273,27 +263,22 @@ def _scaled(volume: Volume, made_of: Material) -> Volume:
 def scatter_object(parts: Sequence[Channel], size_mm: Vector, voxels: int) -> Object:
     """Sample the materials of a phantom on one grid about the origin.
 
-    Negative amounts count as 0. A side of the box is taken as at least 1e-3 of the
-    longest. Without parts the last axis of the data is empty.
+    Negative amounts count as 0. A side of the box is 1e-3 of the longest at least.
 
     Args:
         parts: from `channels`.
-        size_mm: the phantom's extent along x, y, z [mm].
-        voxels: about so many cubes fill that box.
+        voxels: about so many cubes fill the box.
 
     Returns:
-        The amount of each material in each voxel, float32 (z, y, x, materials), and the
-        substances.
+        Amounts, float32 (z, y, x, materials), and the substances.
 
     Raises:
         PhantomError: a mesh that is not closed.
 
     Example:
         >>> from flexdt.phantoms import load_phantom
-        >>> from flexdt.phantoms.channels import channels
         >>> lego = load_phantom("lego")
-        >>> grid = scatter_object(channels(lego), lego.size_mm, 20_000)
-        >>> [one.name for one in grid.substances]
+        >>> [one.name for one in scatter_object(channels(lego), lego.size_mm, 20_000).substances]
         ['abs', 'steel']
     """
     least = max(size_mm) * 1e-3

@@ -54,10 +54,7 @@ class PhantomError(TwinError):
 
 
 def wrong(value: object, where: str, allowed: str) -> PhantomError:
-    """Make the error for a value that is not what is `allowed` at key path `where`;
-    returned, not raised.
-
-    The value is shown with at most 80 characters."""
+    """Make (do not raise) the error for a value that is not `allowed` at a key path."""
     shown = repr(value)
     if len(shown) > 80:
         shown = shown[:77] + "..."
@@ -89,11 +86,9 @@ def fields(
 ) -> dict[str, Any]:
     """Read the fields of an object; a key without a reader is an error.
 
-    `value`: the object; `where`: its key path; `needed`: name -> reader of a field that must be
-    there; `others`: name -> reader of a field that may be left out.
-    Returns name -> result of its reader; fields that are left out have no entry.
-    Raises PhantomError: no object, a missing or unknown key, or an error of a reader; names the
-    key path.
+    `needed` and `others` (may be left out): name -> reader. Returns name -> its result,
+    of those given. Raises PhantomError: no object, a missing or unknown key, or a
+    reader's error; with the key path `where`.
     """
     readers = {**needed, **others}
     for key in mapping(value, where):

@@ -31,14 +31,11 @@ MAX_COMPARED_BODIES: Final = 2000
 
 
 def united(mesh: TriangleMesh) -> TriangleMesh | None:
-    """Unite the overlapping bodies of a mesh; return the mesh itself where the boxes around its
-    bodies are apart.
+    """Unite the overlapping bodies of a closed mesh; itself where their boxes are apart.
 
-    Shells turned inwards are cavities of the body around them. A mesh of one body is returned
-    unchecked.
-    `mesh`: closed; not changed.
-    Returns the united mesh; None where the surface of a body meets itself, so that it has no
-    inside."""
+    Shells turned inwards are cavities. A mesh of one body is unchecked. None where the
+    surface of a body meets itself, so that it has no inside.
+    """
     bodies = _bodies(mesh)
     if not _boxes_meet([mesh.vertices[np.unique(mesh.faces[body])] for body in bodies]):
         return mesh

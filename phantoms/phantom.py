@@ -161,16 +161,11 @@ class Phantom(ArrayValue):
         return joined(parts_of(*pieces, self.beads, around=around))
 
     def volume(self, voxel_mm: float | None = None, *, oversample: int = 2) -> Volume:
-        """Convert to voxels for X-rays.
+        """Convert to voxels of attenuation [1/mm], [z, y, x], about the origin.
 
-        Nothing is cached. A phantom that came as voxels is returned on its own grid, without use
-        of the arguments.
-
-        `voxel_mm`: voxel edge [mm]; default: 256 voxels along the longest side. `oversample`:
-        samples per voxel along each side.
-        Returns volume of attenuation [1/mm], data [z, y, x], about the origin (voxels: about
-        their own center).
-        Raises PhantomError: voxels together with other parts, or as `voxelise`.
+        A phantom that came as voxels keeps its own grid, whatever the arguments.
+        `voxel_mm`: default: 256 along the longest side. Raises PhantomError: voxels
+        together with other parts, or as `voxelise`.
         """
         if self.voxels is not None:
             if not self.is_voxels:

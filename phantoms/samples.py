@@ -393,10 +393,10 @@ def _labelled(
 
 
 def _mesh(mesh: Any, material: str | None) -> Phantom:
-    """Make the phantom of an object with vertices [mm] and faces, filled with one material.
+    """Make the phantom of an object with vertices [mm] and faces, of `abs` or another
+    material.
 
-    `mesh`: has (n, 3) vertices and (m, 3) faces; not changed. `material`: None is `abs`.
-    Raises PhantomError: it is not closed, or its size is 0 or too large.
+    Raises PhantomError: open, or of size 0 or too large.
     """
     import trimesh
 

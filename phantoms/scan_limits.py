@@ -47,17 +47,9 @@ def check_distances(
     sod_mm: float,
     sdd_mm: float,
 ) -> None:
-    """Check that the machine has an exposure and distances, by composing a script of
-    them.
+    """Check that the machine has an exposure and distances, by composing a script.
 
-    The script is thrown away; the region of the camera is not checked here. Motors have
-    the zero offsets of the machine's own profile.
-
-    Args:
-        machine: whose camera and motors these are.
-        camera: mode and region.
-        exposure: tube and time.
-        sod_mm, sdd_mm: source to axis and to panel.
+    The camera's region is not checked. Zero offsets are the machine's.
 
     Raises:
         LimitError: names the value and the allowed ones.
@@ -79,15 +71,7 @@ def check_distances(
 def check_placement(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int]) -> None:
     """Check that source and panel are outside the sample, and that some ray meets it.
 
-    Other findings about the geometry are ignored.
-
-    Args:
-        phantom: about the origin.
-        cone_vec: the views.
-        shape: detector (rows, cols).
-
-    Raises:
-        TwinError: the first finding, with its remedy.
+    Raises TwinError: the first such finding.
     """
     half = np.array(phantom.size_mm) / 2.0
     findings = examine(Operation.SIMULATE, cone_vec, shape, boxes=[[-half, half]])
@@ -103,16 +87,8 @@ def open_beam_doubts(
 ) -> list[str]:
     """Warn if the open beam saturates or starves the panel.
 
-    Args:
-        machine: its tube and detector.
-        camera: mode and region.
-        exposure: tube and time.
-        view: cone_vec row (12,).
-        physics: how counts are made.
-
-    Returns:
-        One sentence, with an exposure that would do; [] where the beam is in range, or
-        `physics` makes no counts of it.
+    `view`: cone_vec row. Returns one sentence with an exposure that would do; [] if in
+    range, or not known.
     """
     beam = open_beam_of(machine, camera, exposure, view, physics)
     doubt = None

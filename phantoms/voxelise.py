@@ -163,10 +163,7 @@ def _add_surface(
 
 
 def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
-    """Return the first voxel, and the last plus one, that an extent [mm] touches along one axis.
-
-    The grid of `n` voxels is centered on 0; the range is cut to it.
-    """
+    """Return first and last + 1 of n voxels, about 0, in an extent [mm]."""
     return (
         max(math.floor(low / voxel_mm + n / 2.0 - 1e-9), 0),
         min(math.ceil(high / voxel_mm + n / 2.0 + 1e-9), n),
@@ -174,10 +171,9 @@ def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
 
 
 def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
-    """Compute the lowest and highest z of a shape above each (x, y); exact, not sampled.
+    """Compute the lowest and highest z [mm] of a convex shape above each (x, y), exactly.
 
-    `shape`: convex; `x`: of the columns, broadcast with y [mm]; `y`: of the columns [mm].
-    Returns lower and upper end [mm]; lower > upper where the column misses the shape.
+    Lower > upper where the column misses it.
     """
     one = as_convex(shape)
     bottom, top = _between_slabs(one.slabs, x, y)

@@ -131,10 +131,9 @@ class AcquilaEvent:
     def answer(
         self, reply_type: ReplyType, reply: str = "", comp_type: str = ""
     ) -> AcquilaEvent:
-        """Make the event that replies to this one: all fields the same but those given.
+        """Make the event that replies to this one.
 
-        `reply_type`: RCV, FDB, ACK or ERR. `reply`: text for the sender of the command.
-        `comp_type`: of the component that replies; left empty, that of this event.
+        `comp_type`: empty: this event's.
         """
         return replace(
             self,
@@ -209,9 +208,7 @@ class Exchange:
     def __init__(
         self, command: AcquilaEvent, comp_type: ComponentType, now: float
     ) -> None:
-        """Begin an exchange with the command that was sent; `now` is the moment of its last
-        message.
-        """
+        """Begin an exchange with a command sent `now`."""
         self.command = command
         self._type = comp_type
         self._last = now
@@ -245,15 +242,10 @@ def _attribute(name: str) -> str:
 
 
 def _text(content: Mapping[str, object], name: str) -> str:
-    """Read one text field of an event; a number becomes its text, a truth value TRUE or FALSE.
+    """Read one text field of an event; missing or null is "", true becomes TRUE.
 
-    Args:
-        content: the event's JSON object.
-        name: of the field; missing or null gives "".
-
-    Returns the text, checked by `_plain`.
-    Raises AcquilaError: a list or an object, or a text that is too long or has characters that
-    no event can carry.
+    Raises AcquilaError: a list or an object, or a text that is too long or that no event
+    can carry.
     """
     value = content.get(name, "")
     match value:

@@ -42,9 +42,8 @@ class Codec(Enum):
 def read_json(data: bytes | bytearray | memoryview) -> object:
     """Parse one JSON document; a leading byte order mark is dropped.
 
-    Raises:
-        ValueError: no JSON, invalid UTF-8, NaN or infinity, nesting above `MAX_DEPTH`, or
-            an object with one name twice; names the problem and, where known, its place.
+    Raises ValueError: no JSON, NaN or infinity, nesting above `MAX_DEPTH`, or one name
+    twice.
     """
     raw = bytes(data).removeprefix(BYTE_ORDER_MARK)
     try:

@@ -204,12 +204,9 @@ class Connection:
         return out
 
     def receive_end(self) -> None:
-        """End reception: the peer has ended the stream.
+        """End reception: the peer has ended the stream; messages not taken are dropped.
 
-        The connection is closed in any case, and messages not taken out are discarded. If it was
-        closed before, nothing happens.
-
-        Raises ProtocolError: it ended inside a message, so that message is lost.
+        Raises ProtocolError: it ended inside a message.
         """
         inside = self.mid_message and not self.closed
         held = self.pending
@@ -417,11 +414,9 @@ class Connection:
         self._begun.clear()
 
     def next_raw(self) -> bytes | Malformed | None:
-        """Take the next message's bytes, or an error, out of the queue; None if none
-        waits.
+        """Take the next message's bytes, or an error, out of the queue.
 
-        Errors come in their place among the messages. One that is not fatal ends nothing;
-        a fatal one closes the connection, and nothing follows it.
+        After a fatal error nothing follows.
         """
         if not self.whole:
             return None
@@ -463,21 +458,12 @@ class Connection:
         wanted: Callable[[bytes], bool],
         most: int = 32,
     ) -> list[bytes]:
-        """Take urgent messages out of the queue before their turn.
+        """Take urgent messages out of the queue before their turn, in order.
 
-        Every message up to `MAX_EXAMINED_BYTES` is examined once: first its bytes are
-        searched, which is fast, and only a message that `may_name` one of `names` is
-        passed to `wanted`, which may decode it. Errors, larger messages and those that
-        `wanted` declines keep their place.
-
-        Args:
-            names: names of urgent methods, as bytes.
-            wanted: returns whether the message with these bytes is taken out.
-            most: largest number of messages passed to `wanted` in one call; `unjudged` is
-                then true if more remain.
-
-        Returns:
-            The bytes of the messages taken out, in order; `next_raw` never returns these.
+        Messages up to `MAX_EXAMINED_BYTES` are examined once: only one that `may_name`
+        one of `names` is passed to `wanted`, which decides and may decode it. Others keep
+        their place. `most`: passed to `wanted` in one call; `unjudged` is then true if
+        more remain.
         """
         out = list[bytes]()
         looked = 0
@@ -529,10 +515,7 @@ class Connection:
         self._held = self._skip = 0
 
     def send(self, message: Message | Prepared) -> bytes:
-        """Encode a message, framing included; as JSON until the codec is known.
-
-        Raises ValueError, TypeError: the message holds a value that cannot be encoded; RpcError:
-        -32008, a MessagePack frame of 16 MiB or more."""
+        """Encode and frame a message. Raises ValueError, TypeError, RpcError."""
         pieces = self.pieces(message)
         if len(pieces) == 1:
             return pieces[0]
@@ -610,17 +593,9 @@ def _foreign_opening(begun: bytes | bytearray) -> str | None:
 
 
 def may_name(codec: Codec, raw: bytes, names: tuple[bytes, ...]) -> bool:
-    """Return whether an encoded document may contain one of `names` as a text.
+    """Return whether a document may contain one of the names; False is certain.
 
-    False is certain, True is not: a valid document that contains the text never gives
-    False. MessagePack writes a text as its bytes. JSON writes each character of it as
-    itself or as an escape, and the only escape of a printable ASCII character other than
-    `"`, `/` and the backslash is `\\u00` and two hexadecimal digits.
-
-    Args:
-        codec: of the document.
-        raw: its bytes, or those of several.
-        names: of printable ASCII characters other than these three.
+    JSON may escape characters.
     """
     if any(name in raw for name in names):
         return True
@@ -654,10 +629,11 @@ def encoded(result: object, codec: Codec) -> Encoded:
 
 
 def _body(codec: Codec, message: Message) -> list[bytes]:
-    """Encode a message without framing; an `Encoded` result is inserted as it is. The pieces of
-    an `Encoded` result must be of this codec. `codec`: of the connection; `message`: an answer,
-    a call or a batch. Returns the parts of the message in order, as bytes. Raises ValueError,
-    TypeError, OverflowError: a value that the codec cannot hold."""
+    """Encode a message without framing, in pieces; an `Encoded` result of this codec as
+    it is.
+
+    Raises what `to_plain` does.
+    """
     match message:
         case Response(id, Encoded(pieces)):
             return _around(codec, id, pieces)
@@ -764,13 +740,11 @@ def pack(message: Message) -> tuple[bytes, memoryview | None]:
 
 
 def unpack(body: memoryview) -> Message:
-    """Decode a frame's body, without its length, to a message.
+    """Decode a frame's body to a message, or `Malformed`.
 
-    Bytes that are not MessagePack give `Malformed` with a parse error, other documents
-    that are no message `Malformed` as `from_plain`.
-
-    In a body above `MAX_COPIED_BYTES` whose last member is a large `data`, the data
-    becomes a view into `body`, without a copy."""
+    In a body above `MAX_COPIED_BYTES` whose last member is a large `data`, that becomes a
+    view, without a copy.
+    """
     try:
         document = None
         if len(body) > MAX_COPIED_BYTES:
@@ -796,18 +770,10 @@ def _large(data: object) -> memoryview | None:
 def _split(body: memoryview) -> object | None:
     """Decode a frame with a large `data` as a view of `body`, without a copy.
 
-    The head of the frame is searched for `data` with a 32-bit length that reaches exactly
-    to the end of the frame. The same bytes may occur inside another value, so each
-    candidate is decoded without its payload first; only the first `_HEAD_WINDOWS_BYTES`
-    are searched, and at most `_MAX_SPLIT_ATTEMPTS` candidates decoded, which limits the
-    work that a hostile frame can cause.
-
-    Args:
-        body: a frame without its length.
-
-    Returns:
-        The document; None where no candidate in these windows decodes: the caller then
-        decodes the whole frame.
+    `data` is searched for with a 32-bit length to the frame's end. The same bytes may
+    occur inside another value, so each candidate is decoded without its payload first,
+    `_MAX_SPLIT_ATTEMPTS` at most, as frames may be hostile. Returns None without one: the
+    caller then decodes the whole frame.
     """
     attempts = 0
     for window in _HEAD_WINDOWS_BYTES:
@@ -829,12 +795,8 @@ def _split(body: memoryview) -> object | None:
 def _with_payload(head: bytes, payload: memoryview) -> object | None:
     """Decode a frame's head and put `payload` in place of its last `data`.
 
-    Args:
-        head: MessagePack up to the type byte of `data`.
-        payload: the bytes of `data`.
-
-    Returns the document; None if `head` with an empty `data` is no MessagePack, or `data` is not
-    its last member.
+    `head` ends with the type byte. None if it is no MessagePack, or `data` is not its
+    last member.
     """
     try:
         document = codecs.read_msgpack(head + _EMPTY_BIN)

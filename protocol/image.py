@@ -39,16 +39,10 @@ def encode(array: npt.NDArray[np.generic]) -> dict[str, object]:
 
 
 def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
-    """Convert an image value to an array, read-only, without a copy where `data` is bytes.
+    """Convert an image value to an array, read-only, without a copy of bytes.
 
-    Base64 text is decoded to a copy.
-
-    Args:
-        value: a mapping with dtype (one of `DTYPES`), shape (up to four sizes) and data
-            (bytes, or base64 text); other members are ignored.
-
-    Raises RpcError: -32602: a member is missing, an unknown dtype, an invalid shape, or data of
-    another size or type; the message names the member.
+    `value`: dtype (one of `DTYPES`), shape (up to four) and data (bytes, or base64 text).
+    Raises RpcError: -32602: a member is missing or wrong; names it.
     """
     try:
         dtype = value["dtype"]

@@ -163,11 +163,9 @@ def to_plain(message: Message) -> object:
 
 
 def finite(data: object) -> object:
-    """Replace NaN and infinities in the `data` of an error by text; JSON has no such
-    numbers.
+    """Replace NaN and infinities in an error's `data` by text, as JSON has none.
 
-    An error repeats the value that it is about, which may have overflowed. Dicts and
-    lists are copied, at all levels, and tuples become lists; names and other values stay.
+    Dicts, lists and tuples are copied at all levels, as an error repeats what overflowed.
     """
     match data:
         case float():
@@ -370,19 +368,10 @@ class Correlation(Generic[_W]):
     def request(
         self, method: str, params: Mapping[str, object], waiter: _W, trace: str = ""
     ) -> Request:
-        """Make a request with a new id and register who waits for its answer. Ids are 1,
-        2, ..., or "trace/number" with a trace.
+        """Make a request with a new id and register who waits for its answer.
 
-        Args:
-            method: name of the method.
-            params: by name; a value that cannot be encoded is found when the message is
-                sent.
-            waiter: returned with the answer.
-            trace: prefix of the id, so that the server's log shows the cause of the
-                request.
-
-        Raises:
-            TypeError: a name in `params` is not text, which no server could read.
+        Ids are 1, 2, ..., after "trace/". Raises TypeError: a name in `params` is no
+        text.
         """
         _require_text_names(params, method)
         number = next(self._ids)
@@ -391,9 +380,10 @@ class Correlation(Generic[_W]):
         return Request(id, method, dict(params))
 
     def abandon(self, request: Request, *, sent: bool = True) -> None:
-        """Stop waiting for an answer; one that still comes is dropped. A request that is not
-        open is ignored. `request`: made by `request`; `sent`: False if no byte of it was sent:
-        it is forgotten, and an answer to it would be a violation."""
+        """Stop waiting for an answer, to be dropped.
+
+        Not `sent`, an answer would be a violation.
+        """
         if not sent:
             self._open_requests.pop(request.id, None)
         elif request.id in self._open_requests:
@@ -446,26 +436,11 @@ class Correlation(Generic[_W]):
     # -- both sides --------------------------------------------------------------------------
 
     def receive(self, message: Message) -> list[Answered[_W] | Request | Notification]:
-        """Match a message from the peer to the open requests, item by item for a batch.
+        """Match a message from the peer to the open requests, item by item.
 
-        On a server, calls are returned, and a request is open from then on; malformed
-        messages give nothing, and the caller must answer them with `reply`.
-
-        On a client, notifications are returned, and an answer with its waiter; an answer
-        to an abandoned request gives nothing. A malformed message with an id counts as
-        the answer to that request. A parse error without id fails all open requests; any
-        other error without id is kept as `reason` and gives nothing.
-
-        Args:
-            message: what the peer sent.
-
-        Returns:
-            Calls, and answers with their waiters, in order.
-
-        Raises:
-            ProtocolError: the peer may not send this (a request to a client, an answer to
-                a server or to no open request, a fatal error), or a violation happened
-                before. `violation` keeps it.
+        A server gets calls, open from then on; a client notifications, and answers with
+        waiters, also of a malformed message with an id. A parse error without one fails
+        all. Raises ProtocolError: the peer may not send this; `violation` keeps it.
         """
         if self.violation is not None:
             raise self.violation
@@ -544,12 +519,8 @@ class Correlation(Generic[_W]):
     ) -> list[Answered[_W] | Request | Notification]:
         """Register a client's call as open, and return it in a list.
 
-        Args:
-            message: of a client; not a batch.
-
-        Returns the request or notification; an empty list for a malformed message, whose id is
-        owed an answer all the same.
-        Raises ProtocolError: an answer instead of a call; recorded as the violation.
+        A malformed message gives [], but its id is owed an answer. Raises ProtocolError:
+        an answer instead.
         """
         match message:
             case Request(id):
@@ -572,8 +543,8 @@ class Correlation(Generic[_W]):
 def hello_params(client: str, token: str | None) -> dict[str, object]:
     """Make the parameters of `session.hello`, with which a client begins.
 
-    `client`: name of the program, for people who look at the server; `token`: where the server
-    requires one. Returns {"protocol": version, "client": name}, and "token" if there is one."""
+    `client`: the program, for people.
+    """
     params: dict[str, object] = {"protocol": PROTOCOL, "client": client}
     if token is None:
         return params

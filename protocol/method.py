@@ -90,16 +90,9 @@ def parse_params(
 ) -> _P:
     """Validate the parameters of a call, given by name, by position, or not at all.
 
-    Missing parameters take their defaults. A name that the model does not have is a problem if
-    the model forbids it.
-
-    Args:
-        method: the called method.
-        given: names and values, or values in the order of the method's fields, or None.
-
-    Returns the model of the method's parameters, with defaults filled in.
-    Raises RpcError: -32602, too many values, or every problem (at most 50) with its path and
-    value.
+    Missing parameters take their defaults. Raises RpcError: -32602, too many values, or
+    every problem (at most 50) with its path and value; unknown names if the model forbids
+    them.
     """
     fields = method.params.model_fields
     if isinstance(given, list):

@@ -101,10 +101,10 @@ def _stack(value: object) -> object:
 
 
 def _buffer(value: object) -> object:
-    """View the bytes of a `data` field, raw or base64, as a read-only memoryview.
+    """View a `data` field, raw or base64, as a read-only memoryview.
 
-    Bytes are not copied, base64 is decoded.
-    Raises ValueError: neither bytes nor base64."""
+    Raises ValueError: neither.
+    """
     try:
         return memoryview(image.payload(value)).toreadonly()
     except RpcError as error:
@@ -187,10 +187,10 @@ class VolumePut(f.Params):
 
     @model_validator(mode="after")
     def _one(self) -> VolumePut:
-        """Check that exactly one of scene, grid and mesh is given, and data where it belongs.
+        """Check that exactly one of scene, grid and mesh is given, and data where it
+        belongs.
 
-        A scene has no data, a grid and a mesh need it. Returns the value unchanged.
-        Raises ValueError: none or several of the three, or data missing or out of place.
+        A scene has none. Raises ValueError.
         """
         if sum(one is not None for one in (self.scene, self.grid, self.mesh)) != 1:
             raise ValueError("give one of scene, grid, mesh")
@@ -392,13 +392,9 @@ PROJECTOR_METHODS: Final[Mapping[str, AnyMethod]] = {
 
 
 def unknown_volume(name: str, there: Sequence[str]) -> RpcError:
-    """Make the error -32602 for a volume that the projector does not have; returned, not raised.
+    """Make (do not raise) the error -32602 for an unknown volume.
 
-    Args:
-        name: that was asked for.
-        there: names of the volumes that it has, the last used last.
-
-    Returns the error; it lists the last `MAX_LISTED_NAMES` names and how many others there are.
+    It lists the last `MAX_LISTED_NAMES` of those `there`, and how many others there are.
     """
     last = sorted(there[-MAX_LISTED_NAMES:])
     older = len(there) - len(last)

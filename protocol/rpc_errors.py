@@ -95,10 +95,10 @@ def method_not_found(asked: str, allowed: Iterable[str]) -> RpcError:
 def invalid_params(
     message: str, problems: Sequence[Mapping[str, object]] = (), allowed: object = None
 ) -> RpcError:
-    """Make the error -32602 for parameters that do not fit; returned, not raised. `message`: for
-    people. `problems`: made by `problem`, for the data. `allowed`: the values that would fit;
-    None leaves it out. Returns the error; its data has the keys problems (a list) and, if given,
-    allowed."""
+    """Make (do not raise) the error -32602 for parameters that do not fit.
+
+    `problems`: of `problem`; they and `allowed` are its data.
+    """
     data: dict[str, object] = {"problems": [dict(p) for p in problems]}
     if allowed is not None:
         data["allowed"] = allowed
@@ -133,11 +133,10 @@ def not_authorised() -> RpcError:
 def too_large(
     what: str, asked: float | str, allowed: float, unit: str = "bytes"
 ) -> RpcError:
-    """Make the error -32008 for something above its allowed size; returned, not raised.
+    """Make (do not raise) the error -32008 for something above its allowed size.
 
-    `what`: the thing, with its article; `asked`: its size, in `unit`; `allowed`: largest size,
-    in `unit`; `unit`: unit of both.
-    Returns the error; its data has the four arguments by name."""
+    `what`: with its article.
+    """
     return RpcError(
         Code.TOO_LARGE,
         f"{what} of {asked} {unit} is too large; at most {allowed} {unit}",

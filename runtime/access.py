@@ -174,9 +174,9 @@ def limit_names(limits: ConnectionLimits | TwinLimits | ViewerLimits) -> tuple[s
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address to listen on can be reached from this machine only.
+    """Return whether an address to listen on is for this machine only.
 
-    True for "localhost" and loopback addresses. Other names are not looked up, and False.
+    Names are not looked up.
     """
     if host == "localhost":
         return True

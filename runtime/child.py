@@ -35,9 +35,7 @@ def main() -> None:
 
 
 def _watch() -> None:
-    """Read and drop standard input until it closes, then send SIGTERM to this process;
-    `STOP_GRACE_S` later exit at once with code 1.
-    """
+    """Read standard input until it closes, then end: SIGTERM, later at once."""
     while os.read(0, 4096):
         pass
     os.kill(os.getpid(), signal.SIGTERM)

@@ -30,20 +30,10 @@ def limit() -> int | None:
 def fitted(
     clients: int, waiting: int, reserved: int, most: int | None
 ) -> tuple[int, int]:
-    """Return how many clients have a place and how many connections may wait without one,
-    so that reserved places and `KEPT` descriptors are left.
+    """Return how many clients and waiting connections leave `KEPT` descriptors of `most`.
 
-    Args:
-        clients, waiting: that are wanted.
-        reserved: places for urgent requests.
-        most: descriptors that there are; None: any number.
-
-    Returns:
-        Clients and waiting connections, at least one each.
-
-    Example:
-        >>> fitted(512, 512, 16, 65536), fitted(512, 512, 16, 256)
-        ((512, 512), (84, 28))
+    `reserved`: places for urgent requests. At least one each: `fitted(512, 512, 16, 256)`
+    is (84, 28).
     """
     if most is None or clients + waiting + reserved + KEPT <= most:
         return clients, waiting

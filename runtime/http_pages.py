@@ -66,9 +66,9 @@ def _figure(
     kind: str, name: str, help: str, values: float | Mapping[str, float], label: str = ""
 ) -> Metric:
     """Make a figure of the metrics page, with one value or one for each value of a label.
-    `kind`: gauge or counter. `name`: of the figure; a counter's ends with `_total`. `help`: one
-    sentence. `values`: its value, or label value -> value. `label`: name of the label; ""
-    without one."""
+
+    `kind`: gauge or counter, whose name ends with `_total`.
+    """
     metric = Metric(name.removesuffix("_total"), help, kind)
     for what, value in values.items() if isinstance(values, Mapping) else [("", values)]:
         metric.add_sample(name, {label: what} if label else {}, value)

@@ -149,10 +149,10 @@ def dropped() -> int:
 def log(
     event: str, level: int = logging.INFO, *, error: bool = False, **facts: object
 ) -> None:
-    """Write one log line, with the trace in force.
+    """Write one log line of `facts`, with the trace in force.
 
-    `event`: name of the event; `level`: of `logging`; `error`: add the traceback of the
-    exception being handled; `facts`: further members of the line."""
+    `error`: add the traceback.
+    """
     trace = current()
     if trace:
         facts.setdefault("trace", trace)
@@ -222,13 +222,10 @@ class Sparing:
 def set_up(
     stream: TextIO = sys.stderr, level: int = logging.INFO, *, apart: bool = False
 ) -> None:
-    """Send this program's log to `stream` as JSON lines, in place of its earlier handlers (for a
-    process's main).
+    """Send this program's log to `stream` as JSON lines, in place of earlier handlers.
 
-    The root logger's handlers get these lines no longer.
-
-    `stream`: target; `level`: least level that is written; `apart`: write from a thread of its
-    own, and send warnings and lines of `LIBRARIES` there, too (a server's main).
+    The root logger's get these lines no longer. `apart`: from a thread of its own, with
+    warnings and lines of `LIBRARIES`, as a server.
     """
     handler: logging.Handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonLines())

@@ -284,9 +284,7 @@ def stop_signal() -> asyncio.Event:
     watch = signal.set_wakeup_fd(-1)
 
     def begin_to_stop() -> None:
-        """Set the event, and wake the reader of the wake-up descriptor that was set before,
-        if any.
-        """
+        """Set the event, and wake the earlier wake-up descriptor's reader."""
         stop.set()
         if watch != -1:
             with contextlib.suppress(OSError):
@@ -298,10 +296,7 @@ def stop_signal() -> asyncio.Event:
 
 
 def leave(*_: object) -> None:
-    """End the process now, as a signal's handler, with a line on standard error.
-
-    Buffers are not flushed and no clean-up runs; the exit code is `INTERRUPTED`.
-    """
+    """End the process now, with `INTERRUPTED` and a line."""
     try:
         os.write(2, INTERRUPTED_LINE)
     finally:
@@ -319,13 +314,10 @@ async def first_of(*events: asyncio.Event) -> None:
 
 
 def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None) -> None:
-    """Print the JSON line of a ready server: `ready`, `facts`, and the process id.
+    """Print the JSON line of a ready server: its kind, `facts`, process id.
 
-    In a `ServerLoop` garbage is collected and the remaining objects are frozen first, and the
-    measurement of the loop's turns begins anew.
-
-    `server`: its kind, the value of `ready`. `facts`: further members of the line. `out`: file;
-    None: standard output.
+    A `ServerLoop` freezes what garbage collection left, and measures its turns anew.
+    `out`: None: standard output.
     """
     loop = asyncio.get_running_loop()
     if isinstance(loop, ServerLoop):
@@ -345,24 +337,14 @@ def announce_bound(server: str, host: str, port: int) -> None:
 
 
 def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> int:
-    """Raise the limit on open descriptors, run the work of a process to its end in an
-    event loop of its own, and print an error on standard error.
+    """Run the work of a process to its end in an event loop; return its exit code.
 
-    Of an error it returns USAGE after an AccessError (INVALID for one of its files),
-    INVALID after a TwinError, ValueError or an OSError of a file, REFUSED after another
-    OSError. Other errors are raised.
+    An error is printed: USAGE after an AccessError (INVALID for its file), INVALID after
+    a TwinError, ValueError or an OSError of a file, REFUSED after another; others are
+    raised.
 
-    SIGINT ends the process at once until the work calls `stop_signal`: no client has
-    been answered yet, and an exception within asyncio's loop can lose the turn of a
-    task, which then never ends. An ignored SIGINT stays ignored.
-
-    Args:
-        settings: of the process; `host` and `port` are where it listens.
-        run: the work; returns its own exit code, and calls `stop_signal` before it
-            announces that it is ready.
-
-    Returns:
-        Exit code: that of the work, or INVALID, USAGE or REFUSED after an error.
+    SIGINT, unless ignored, ends the process until the work calls `stop_signal`, before it
+    is ready: an exception within asyncio's loop can lose the turn of a task.
     """
     _allow_descriptors()
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:

@@ -79,11 +79,9 @@ class WaitingList(Generic[_G]):
 
 
 def neighbourhood(host: str) -> str:
-    """Return the address by which connections are counted: an IPv4 address itself, or the
-    first 64 bits of an IPv6 address (one owner's) as a network.
+    """Return the address by which connections are counted: IPv4, or IPv6's first 64 bits.
 
-    An IPv4 address written as IPv6 counts as IPv4. A zone is cut off. A text that is no
-    address is returned unchanged.
+    IPv4 within IPv6 counts as IPv4; zones are cut off. Other texts stay.
     """
     try:
         address = ipaddress.ip_address(host.partition("%")[0])

@@ -162,11 +162,9 @@ def main() -> int:
 
 
 def _end_with_parent(number: int) -> None:
-    """Wait until the parent closes its end of the socket, then exit the process at once with
-    code 0.
+    """Wait until the parent closes its socket, then exit with code 0.
 
-    On systems that cannot poll for that it returns at once.
-    `number`: descriptor of the socket.
+    Return at once if that cannot be polled.
     """
     if not hasattr(select, "POLLRDHUP"):
         return

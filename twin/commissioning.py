@@ -277,12 +277,10 @@ def scanner_of(scan: PastScan, known: Sequence[Machine]) -> Scanner:
 
 
 def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
-    """Count the motors whose lower and upper limit are those of a machine file, within
+    """Count the motors whose limits are those of a machine file, within
     `RELATIVE_TOLERANCE`.
 
-    Names are translated to the machine's own; unknown ones do not count.
-
-    `limits`: motor -> (lower, upper); `machine`: to compare with.
+    Names are translated to the machine's. `limits`: motor -> (lower, upper).
     """
     axes = {name: machine.axes.get(own_name(name, machine.axes)) for name in limits}
     return sum(

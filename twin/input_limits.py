@@ -125,12 +125,9 @@ def require_parts(form: str, count: int, file: str) -> None:
 
 
 def require_strips(counts: Sequence[int], size: int, file: str) -> None:
-    """Check the strips or tiles of a TIFF: their number, and that together they are no longer
-    than the file, so that none is read twice.
+    """Check a TIFF's strips: their number, and that together they fit in the file.
 
-    `counts`: bytes of each in the file, as its head states them; `size`: of the file [bytes];
-    `file`: name for the message.
-    Raises InputLimitError: too many, or longer.
+    So none is read twice. `size`: [bytes]. Raises InputLimitError.
     """
     require_parts("tiff", len(counts), file)
     claimed = sum(counts)

@@ -19,12 +19,9 @@ def parse_json(
 ) -> Any:
     """Parse a JSON document, after an optional byte order mark; objects become `kind`.
 
-    `kind` is called with each object's list of (name, value) pairs.
-
-    `text`: that is parsed; `kind`: dict, or a class of it; `file`: name for the message about
-    its size; `form`: row of the table of input limits.
-    Raises InputLimitError: it is too long or has too many values; ValueError: with the reason:
-    no JSON (JSONDecodeError), nested too deep, or a whole number of thousands of digits.
+    `kind` gets each object's list of (name, value) pairs. `form`: row of the input
+    limits. Raises InputLimitError: too long or too many values; ValueError: no JSON,
+    nested too deep, or a whole number of thousands of digits.
     """
     require_json(text, file, form)
     try:

@@ -86,10 +86,10 @@ class BrowserConnection(ServerConnection):
         self.transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """Take received bytes; aborts the connection if all connections together hold
-        more than `MAX_HELD` and this one more than `FAIR_BYTES`.
+        """Take received bytes; abort if all connections hold too much, and this one as
+        well.
 
-        Data beyond are dropped.
+        That is `MAX_HELD`, and `FAIR_BYTES`.
         """
         self._hold(self._held + len(data))
         if self._admission.held > MAX_HELD and self._held > FAIR_BYTES:

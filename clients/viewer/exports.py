@@ -67,8 +67,10 @@ def scene_file(
     form: Form,
     dark: bool,
 ) -> bytes:
-    """Export the live scene as the page shows it to a file: an HTML page with `beside` over it,
-    or viser's own format. See `_file`; `camera` is the first view, `nodes` are those shown."""
+    """Export the live scene as the page shows it: an HTML page, or viser's format.
+
+    `camera` is the first view.
+    """
     serializer = server.get_scene_serializer()
     look_from(serializer, camera, nodes)
     return _file(serializer, form, dark, title, beside)
@@ -118,12 +120,9 @@ def replay_file(
 
 
 def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "") -> bytes:
-    """Convert an exported scene to the content of a file.
+    """Convert an exported scene to an HTML page or viser's file.
 
-    Only html has colors, title and `beside`. The title is escaped, `beside` is not.
-
-    `serializer`: viser's, of the scene; `form`: "html" or "viser"; `dark`: the page's colors;
-    `title`: of the page; `beside`: HTML at its end.
+    The title is escaped, `beside` (HTML at the end) is not.
     """
     match form:
         case "viser":

@@ -86,11 +86,7 @@ class ImageFeed:
             ]
 
     def stop(self) -> asyncio.Future[Any]:
-        """Cancel the feed's tasks at once; the returned future is done once they have
-        ended.
-
-        `newest` stays; `start` may follow at once.
-        """
+        """Cancel the feed's tasks; the returned future is done once they have ended."""
         tasks = self._tasks
         self._tasks = []
         for task in tasks:

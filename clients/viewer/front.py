@@ -461,11 +461,9 @@ async def _down(viser: ClientConnection, browser: ServerConnection) -> None:
 
 
 def _quiet() -> logging.Logger:
-    """Return the library's logger, without the message "opening handshake failed" and its
-    traceback for each connection that sends nothing.
+    """Return the library's logger, without a traceback for each silent connection.
 
-    Such are pages' connections to us, and ours to viser when a page leaves at once, whose
-    logger gets the same filter.
+    Such are pages' connections to us, and ours to viser when a page leaves at once.
     """
     front = logging.getLogger("websockets.front")
     for logger in (front, logging.getLogger("websockets.server")):

@@ -174,8 +174,8 @@ class Page:
     ) -> asyncio.Task[None]:
         """Run work in a task that is canceled when the page closes.
 
-        Returns the task; a failure is logged, not raised.
-        `work`: to run; `what`: word for the log if it fails; `died`: called if it fails."""
+        A failure is logged as of `what`, and calls `died`.
+        """
         task = watched(work, what, died)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -199,10 +199,10 @@ class Page:
         self._over.set()
 
     def say(self, kind: str, **content: object) -> None:
-        """Send something that must arrive, in order; it is converted to JSON now.
+        """Send something that must arrive, in order, as JSON.
 
-        A page with more than `MAX_NOTES` unsent is closed.
-        `kind`: type of the message; `content`: its fields."""
+        A page with `MAX_NOTES` unsent is closed.
+        """
         self._notes.append(json.dumps({"type": kind, **content}))
         if len(self._notes) > MAX_NOTES:
             self._over.set()
@@ -282,10 +282,8 @@ class Page:
         return (b"\0" if self._image else b"\1") + part
 
     def _may_send(self, slot: str) -> bool:
-        """Check that fewer messages of a slot are on the way than allowed, and if so
-        count one more; slots without a limit may always send.
-
-        The limit is that of `ON_THE_WAY`; the time of sending is stored.
+        """Check that a slot may have one more message on the way (`ON_THE_WAY`), and
+        count it.
         """
         if (sent := self._sent_at.get(slot)) is None:
             return True

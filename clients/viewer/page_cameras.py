@@ -137,13 +137,9 @@ class SceneClients:
     def show(self, page: str, nodes: Nodes, plain: Nodes, built: int) -> None:
         """Set the nodes of a page's frames, from one thread only.
 
-        Only nodes that differ from those in the frame are sent. `built` is also compared with
-        the number at the last call: nodes built since are compared with `plain` as well.
-
-        Args:
-            page: its frames; a frame that has not received all nodes yet is left for later.
-            nodes, plain: as wanted, and as built.
-            built: number of messages to all clients when they were built (`Scenes.said`).
+        Only nodes that differ from those in the frame are sent; if `built`, the number of
+        messages to all clients, is another than at the last call, also from `plain`, as
+        built. A frame that has not received all nodes is left for later.
         """
         for client in self.of(page):
             if not self._scenes.heard(id := client.client_id, built):

@@ -19,10 +19,10 @@ BOXES: Final = "<!-- a box for each layer -->"
 
 
 def page_file(name: str) -> bytes:
-    """Read a file of the page as browsers get it; the page itself has the boxes of the layers
-    filled in.
+    """Read a file of the page as browsers get it, boxes of layers filled in.
 
-    Names are not checked here. Raises FileNotFoundError: there is none of this name."""
+    Raises FileNotFoundError: none of this name.
+    """
     content = (resources.files("flexdt.clients.viewer") / "data" / name).read_bytes()
     if name == PAGE:
         return content.replace(BOXES.encode(), boxes(LAYERS).encode(), 1)

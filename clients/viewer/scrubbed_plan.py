@@ -214,12 +214,10 @@ def projection_positions(plan: ScanPlan) -> dict[str, FloatArray]:
 def source_path(
     at: Mapping[str, FloatArray], machine: Machine, profile: Profile, state: State
 ) -> FloatArray:
-    """Compute the focal spot's path in the sample's frame.
+    """Compute the focal spot's path in the sample's frame, (m, 3) [mm].
 
-    Empty (0, 3) without positions. Every k-th is taken, so up to twice as many may remain.
-    `at`: axis -> positions (n,) [mm, deg]; `machine`: its machine; `profile`: its profile;
-    `state`: gives camera and correction.
-    Returns (m, 3) [mm], about ORBIT_POINTS of the n."""
+    About ORBIT_POINTS of the positions (n,) [mm, deg]; (0, 3) without any.
+    """
     count = len(next(iter(at.values()), ()))
     if not count:
         return np.zeros((0, 3))

@@ -55,16 +55,11 @@ class ShownImage:
 
 
 def window_of(image: ShownImage) -> tuple[float, float]:
-    """Choose the values of black and white: all matter but the densest 2 %, so that beads
-    do not set them.
+    """Choose the values (low, high) of black and white, so that beads do not set them.
 
-    For line integrals the lower value is at most 0 and matter is above `AIR`;
-    other images use the percentiles 0.2 and 99.8. Only every fourth row and column is
-    looked at.
-
-    Returns:
-        (low, high), high the greater one: low + 1 where all are equal, and (0, 1) without
-        pixels.
+    Of line integrals low is 0 at most and high the 98th percentile of matter (above
+    `AIR`); other images use the percentiles 0.2 and 99.8. high is low + 1 where all are
+    equal; (0, 1) without pixels.
     """
     pixels = np.asarray(image.pixels[::4, ::4], dtype=np.float32)
     if pixels.size == 0:

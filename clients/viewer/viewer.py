@@ -92,10 +92,9 @@ def _wish(rate_hz: float) -> dict[str, object]:
 
 
 def nearest(safety: SafetyState) -> dict[str, Any]:
-    """Return the nearest parts that may not touch, for pages: their distance "mm" (None:
-    unknown), "pair", and "close" if a warning is due.
+    """Return the nearest parts that may not touch, for pages.
 
-    Due is below `CLOSE_MM`; `pair` is [] if unknown.
+    "close": `CLOSE_MM` or nearer; "mm": None if unknown.
     """
     mm = safety.clearance_mm
     return {
@@ -289,8 +288,7 @@ class Viewer:
     def _state_came(self, data: Mapping[str, Any]) -> None:
         """Keep a state of the twin, and wake the task that draws it.
 
-        A time earlier than the last one means a new twin, whose log entries are numbered
-        anew: they are passed on again.
+        A new twin's log entries are passed on again.
         """
         if data["time"] < self._twin_time:  # a new twin, which counts from 0 again
             self._told = -1
@@ -708,8 +706,7 @@ class Viewer:
             page.show("volume", spoken)
 
     def show_volumes(self) -> None:
-        """Draw each page's volume in that page's frames: on the stage where it fits, as a
-        ghost where the page asks for one; frames that show it so are sent nothing.
+        """Draw each page's volume in its frames: on the stage, or as a ghost.
 
         Frames that have not been sent all that is built are left for later.
         """

@@ -152,8 +152,8 @@ class Scenes:
     def heard(self, client_id: int, said: int) -> bool:
         """Check that a client has been sent the first `said` messages to all clients.
 
-        Messages to it alone have a queue of their own, and could overtake those. An
-        unknown client has been sent nothing."""
+        Messages to it alone could overtake.
+        """
         at = self.server._websock_server._broadcast_buffer.generator_cursors.get(
             client_id, -1
         )
@@ -217,10 +217,8 @@ def set_camera(client: viser.ClientHandle, camera: Standpoint) -> None:
     """Set up direction, place, target and field of view [rad] of a client's camera in one
     message.
 
-    It does not wait for the browser. viser's own setters also replace its record of the camera,
-    and leave out what stands in it already; here the record stays what the frame has reported
-    last, and all four are sent.
-    `client`: of viser, whose first report has come; `camera`: its new one.
+    Unlike viser's own setters it sends all four, and leaves the record as the frame has
+    reported last.
     """
     with client.atomic():
         for message in (

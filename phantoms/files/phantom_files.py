@@ -102,10 +102,10 @@ def load_phantom_file(
 
 
 def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Phantom:
-    """Make the phantom of a document in any of the three forms. With the key `scene` it is a
-    phantom that `Phantom.to_dict` wrote, else with `solid` or `mesh` a scene file, else a bead
-    file. `document`: parsed TOML or JSON. `folder`: of the meshes that a scene file names; None:
-    none may be named. Raises TwinError: names key path, value and allowed values."""
+    """Make the phantom of a document: `Phantom.to_dict`'s, a scene or a bead file.
+
+    `folder`: of meshes that a scene file names. Raises TwinError: with the key path.
+    """
     if "scene" in document:
         return Phantom.from_dict(document)
     if "solid" in document or "mesh" in document:

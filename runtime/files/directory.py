@@ -60,12 +60,9 @@ Write = Callable[[int, memoryview], int]
 
 @contextmanager
 def writing(path: Path, refused: str) -> Iterator[None]:
-    """Convert an OSError within the context to `DatasetWriteError`, of a full disk to
-    `DiskFullError`.
+    """Convert an OSError in the context to `DatasetWriteError`, or `DiskFullError`.
 
-    The error has the path and the system's error number. Other errors are raised as they are.
-
-    `path`: of the written file; `refused`: the failed operation, for the message.
+    `refused`: the failed operation, for the message.
     """
     try:
         yield
@@ -138,11 +135,10 @@ class Directory:
         return self._fd
 
     def held(self) -> Directory:
-        """Hold a folder below another open until `close`: whatever its name refers to later, it
-        stays this directory.
+        """Hold a folder below another open until `close`, whatever its name is then.
 
-        Returns itself.
-        Raises DatasetWriteError: there is no such directory, or a link is in its place."""
+        Raises DatasetWriteError: none, or a link.
+        """
         assert self._above is not None
         with writing(self.path, f"cannot use folder {self.path}"):
             self._fd = self._open_below(self._above)
@@ -177,9 +173,8 @@ class Directory:
     def put(self, name: str, data: bytes | memoryview) -> None:
         """Write a file; a file or a link of that name is replaced as a whole.
 
-        `name`: plain file name, or one that begins with `BEFORE`; `data`: its content.
-        Raises DatasetNameError: the name is not plain; DiskFullError: no room; nothing is left
-        behind; DatasetWriteError: any other refusal of the system.
+        Raises DatasetNameError: no plain name (or of `BEFORE`); DiskFullError;
+        DatasetWriteError.
         """
         if not name.startswith(BEFORE):
             plain_name(name)
@@ -196,13 +191,9 @@ class Directory:
         self.sync()
 
     def overwrite(self, name: str, data: bytes) -> None:
-        """Write the first bytes of an existing file in place, and flush it to the disk; links
-        are not followed.
+        """Write the first bytes of an existing file in place, flushed to the disk.
 
-        The file keeps its further bytes, or grows to the data.
-
-        `name`: of a file that exists; `data`: its new first bytes.
-        Raises OSError: there is no such regular file, or the system refuses.
+        Raises OSError: no such regular file, or refused.
         """
         file = self._open_in_place(name)
         try:
@@ -314,10 +305,11 @@ class Directory:
             return file.read(size)
 
     def link(self, name: str, second: str, to: Directory | None = None) -> None:
-        """Give a file a second name, here or in another directory; links are not followed.
-        `name`: of the file. `second`: its second name. `to`: directory of the second name; None:
-        this one. Raises OSError: there is no such file, the second name is taken
-        (FileExistsError), or the system has no links."""
+        """Give a file a second name, here or in another directory; links are not
+        followed.
+
+        Raises OSError: no such file, the name is taken, or no links.
+        """
         target = self if to is None else to
         with self._opened() as fd, target._opened() as other:
             names = self._at(name), target._at(second)
@@ -474,19 +466,20 @@ class Directory:
                 self._idle.notify_all()
 
     def _open_below(self, above: Directory) -> int | None:
-        """Open this folder's descriptor relative to the directory above, without following a
-        link; the caller closes it. Returns the descriptor; None on a system without such
-        descriptors. Raises OSError: there is no such directory, or a link is in its place."""
+        """Open this folder's descriptor below another, not through a link; None if
+        unsupported.
+
+        Raises OSError.
+        """
         if not _RELATIVE:
             return None
         with above._opened() as fd:
             return os.open(above._at(self.path.name), _DIRECTORY | _NO_FOLLOW, dir_fd=fd)
 
     def _at(self, name: str) -> str:
-        """Check that `name` is one component of a path, and return it for a call with a
-        descriptor, or the whole path on a system without descriptors.
+        """Check that `name` is one component of a path; return it, or the whole path.
 
-        Raises OSError: "", ".", "..", or a name with a slash or a zero byte.
+        Raises OSError. Descriptors need the name alone.
         """
         if name in ("", ".", "..") or "/" in name or "\0" in name:
             raise OSError(errno.EINVAL, "no name of an entry", name)
@@ -516,15 +509,8 @@ class Directory:
         """Write a file under a temporary name and rename it; nothing is left of a
         failure.
 
-        With `sync` the file is flushed to the disk before; the folder is not.
-
-        Args:
-            fd: descriptor of the folder; None where the system has none.
-            name: of the file; one of that name is replaced.
-            data: its content.
-
-        Raises:
-            OSError: the system refuses.
+        With `sync` it is flushed before, the folder is not. `fd`: of the folder; None if
+        unsupported. Raises OSError.
         """
         temporary, file = self._temporary(fd, 0o644)
         try:
@@ -581,11 +567,7 @@ def _allocate(file: int, size: int) -> None:
 
 
 def free_bytes(path: Path) -> int | None:
-    """Return the bytes free for this user on the disk of `path`; None if the system does
-    not report them.
-
-    `path` must exist.
-    """
+    """Return the bytes free for this user on a disk; None if unknown."""
     try:
         usage = os.statvfs(path)
     except (OSError, AttributeError):
@@ -636,11 +618,10 @@ def _fields(file: Path) -> dict[str, int]:
 
 
 def open_data(root: Path) -> Directory:
-    """Open a twin's data directory, made with its parents if missing, and check that
-    files can be written into it.
+    """Open a twin's data directory, made if missing, and check that it can be written.
 
-    The caller closes it. A full disk is no error: state and jobs have own room
-    (`spare_files`). Raises DatasetWriteError: it cannot be made, opened or written.
+    The caller closes it. A full disk is no error: state and jobs have room
+    (`spare_files`). Raises DatasetWriteError.
     """
     refused = f"the data directory {root} cannot be written"
     with writing(root, refused):

@@ -183,10 +183,8 @@ def read_rows(
 ) -> npt.NDArray[Any]:
     """Read some rows of the only image of a file, (rows, cols).
 
-    Of a plain TIFF with the same tags as one that was read before no other row is read.
-
-    `path`: of the file; `shape`: (rows, cols) that the image must have; `rows`: indices of rows.
-    Raises DatasetError: as `read_pixels`, or another shape.
+    Of plain TIFFs with the tags of the last no other row is read. Raises DatasetError: as
+    `read_pixels`, or another `shape`.
     """
     with opened(path) as file:
         some = tiff_images.read_tiff_rows(file, shape, rows)

@@ -301,10 +301,8 @@ def read_or_set_aside(
 ) -> T | None:
     """Read one of our files with `read`; rename and log a damaged one, see `set_aside`.
 
-    `folder` and `name`: of the file; an entry that is no regular file is damaged, too. `read`:
-    parses its bytes; whatever it raises means damage. `without`: how the twin goes on without
-    the file, for the log.
-    Returns the result of `read`, or None if there is no file or a damaged one.
+    Whatever `read` raises means damage. `without`: how the twin goes on, for the log.
+    None without a file.
     """
     try:
         return read(folder.read(name))
@@ -316,13 +314,10 @@ def read_or_set_aside(
 
 
 def set_aside(folder: Directory, name: str, error: object, without: str) -> None:
-    """Rename a damaged file, or another entry of its name, to STEM.unreadable.SUFFIX, and log an
-    error; raises nothing.
+    """Rename a damaged file to STEM.unreadable.SUFFIX, and log the error; raise nothing.
 
-    An earlier one under that name is replaced. If it cannot be renamed, the log line has the
-    reason.
-    `folder`: of the file. `name`: of the file. `error`: why it is set aside; the log has its
-    first 500 characters. `without`: event of the log line.
+    One under that name is replaced. `without`: event of the log line; that has the start
+    of the reason, also why it was not renamed.
     """
     file = folder.path / name
     aside = f"{file.stem}{ASIDE}{file.suffix}"

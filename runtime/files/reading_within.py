@@ -14,11 +14,9 @@ _confined: Directory | None = None
 
 @contextmanager
 def confined(root: Directory) -> Iterator[None]:
-    """Let this process, all threads included, read nothing through a link below `root`
-    within the context; contexts nest.
+    """Read nothing through a link below `root` in the context.
 
-    A user's own folders may well have links in them; paths that strangers request of a
-    server may not.
+    Strangers may request paths.
     """
     global _confined
     before = _confined
@@ -45,10 +43,10 @@ def within(path: Path) -> Directory | None:
 
 
 def opened(path: Path) -> BinaryIO:
-    """Open a file of a data set for reading; where reading is `confined`, links are not
-    followed.
+    """Open a file for reading; links are not followed if `confined`.
 
-    Raises OSError: there is none, or (confined) it is no regular file."""
+    Raises OSError.
+    """
     folder = within(path.parent)
     if folder is None:
         return path.open("rb")

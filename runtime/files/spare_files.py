@@ -40,14 +40,10 @@ class SpareFiles:
         self._refill()
 
     def keep(self, name: str, data: bytes) -> None:
-        """Write a document and wait for the disk; on a full disk write it into a spare
-        file, padded with spaces.
+        """Write a document and wait for the disk; on a full disk into a spare file.
 
-        Into a spare file fits a document of at most `SPARE_BYTES`. Missing spare files
-        are then made, as far as there is room.
-
-        Raises:
-            DatasetWriteError: the system refuses, and no spare file can be used.
+        That holds `SPARE_BYTES`. Missing spare files are then made. Raises
+        DatasetWriteError.
         """
         try:
             self._folder.keep(name, data)

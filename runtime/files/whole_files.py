@@ -22,10 +22,9 @@ OF_LIBRARIES: Final = re.compile(r"No space left|errno = (\d+)|requested and \d+
 
 
 def require_bytes(path: Path, needed: int) -> None:
-    """Check that a disk has room for a file, before anything of it is written.
+    """Check that a disk has room for a file, before it is written.
 
-    `path`: of the file; `needed`: its size [bytes]. Raises OSError: ENOSPC, too little
-    free space; names `path` and both sizes.
+    Raises OSError: ENOSPC, with path and both sizes.
     """
     free = free_bytes(path)
     if needed > free:
@@ -74,11 +73,9 @@ def room_named(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield the path of a hidden file beside `path` to write; at the end it replaces
-    `path`, after a failure it is deleted.
+    """Yield a hidden path to write, which replaces `path` at the end.
 
-    Raises:
-        OSError: see `room_named`.
+    Raises OSError.
     """
     part = path.with_name(f".{path.name}.part")
     try:

@@ -9,17 +9,10 @@ from flexdt.message_words import reason_of
 
 
 def require_writable(path: Path | None) -> None:
-    """Check that a file can be made in the folder of an output path, or in the nearest
-    one above it that exists.
+    """Check that a file can be made in an output's folder, or the nearest above it.
 
-    A file without a name is made there and is gone at once. Whether an existing file may
-    be replaced is not checked.
-
-    Args:
-        path: of a file or a folder that need not exist; None is not checked.
-
-    Raises:
-        OSError: names `path`, and the system's reason.
+    One without a name is made there. Whether an existing file may be replaced is not
+    checked. Raises OSError: names `path`, and the reason.
     """
     if path is None:
         return

@@ -49,16 +49,10 @@ class BeamPlane:
 def fans(
     world: World, lines: npt.NDArray[np.generic], radius_mm: float
 ) -> list[BeamPlane]:
-    """Compute four planes of the beam: through the image's middle column and middle row, each
-    one before the sample, with all light, and one behind it, with the light that passes.
+    """Compute four planes of the beam: through the image's middle column, and its row.
 
-    The transmission is exp(-line integral). The order is column before, column behind, row
-    before, row behind.
-
-    Args:
-        world: of the image's moment.
-        lines: line integrals (rows, cols).
-        radius_mm: of the ball around the sample.
+    Each is one before the sample, with all light, and one behind, with exp(-line
+    integral). `lines`: (rows, cols); `radius_mm`: of the ball around the sample.
     """
     rows, cols = lines.shape
     through = np.exp(-np.asarray(lines, dtype=np.float64))

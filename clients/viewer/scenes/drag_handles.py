@@ -50,11 +50,10 @@ class Gizmos:
     """
 
     def __init__(self, server: viser.ViserServer, machine: Machine, drag: Drag) -> None:
-        """Add a handle for each stage (source, object, detector); `drag` gets the axes'
-        targets when one is dragged.
+        """Add a handle for each stage (source, object, detector).
 
-        The targets are of motors [mm, deg], with viser's client id. Handles are at the
-        origin until the first `update`."""
+        `drag` gets motors' targets [mm, deg], and viser's client id.
+        """
         self._machine = machine
         self._drag = drag
         self._positions: dict[str, float] = {}
@@ -167,10 +166,8 @@ class Gizmos:
     ) -> None:
         """Set the target of the motor that changes a quantity, within its limits.
 
-        Nothing is set if the quantity depends on none or several motors, or if the change is
-        below 0.001.
-        `targets`: motor -> target, added to; `handle`: that is dragged; `quantity`: of the
-        machine's geometry; `change`: of it since the drag began [mm, deg].
+        Not if it depends on none or several motors, or changes by less than 0.001.
+        `change`: since the drag began [mm, deg]; `targets` is added to.
         """
         factors = self._machine.geometry.get(quantity, {})
         if len(factors) != 1 or abs(change) < 1e-3:

@@ -431,14 +431,12 @@ class LabScene:
         self._image.position = tuple(at)
 
     def shapes(self, world: World, shown: Shown, near: bool = False) -> list[Shape]:
-        """Collect the drawn shapes for a picture that needs no browser; any thread may call.
+        """Collect the drawn shapes for a picture that needs no browser, in world frame
+        [m].
 
-        An opaque sample is drawn where it is near and has no dense part. "near" also leaves out
-        panel and beam. The order is parts, sample, panel, beam; the cone is drawn only while
-        X-rays are on. Shapes are in the world's frame [m].
-
-        `world`: of the state that was drawn last; `shown`: by the page; `near`: leave out shapes
-        that do not turn with the sample.
+        `near` leaves out panel, beam, parts that do not turn with the sample, and draws
+        the sample opaque unless it has a dense part. The cone is drawn only while X-rays
+        are on. Any thread may call.
         """
         poses = dict(self._sent)
         out = self._drawn_parts(poses, shown, near)
@@ -480,11 +478,10 @@ class LabScene:
     def show_image(
         self, rgb: npt.NDArray[np.uint8], lines: npt.NDArray[np.generic], world: World
     ) -> None:
-        """Draw an image (rows, cols, 3) on the panel, and its line integrals as the
-        shaded beam.
+        """Draw an image (rows, cols, 3) on the panel, and its line integrals as the beam.
 
-        The ball around the sample is left out of the beam; `rgb` is uint8, `lines` (rows,
-        cols)."""
+        The ball around the sample is left out.
+        """
         self._image.image = rgb
         with self._server.atomic():
             self._shade.show(

@@ -115,9 +115,8 @@ class Shown:
     ) -> dict[str, bool]:
         """Determine whether each node of all layers is visible.
 
-        A part's node is also visible if the part is in `near` and the layer has `near`. Returns
-        node -> bool.
-        `parts`: names of the machine's components; `near`: those near a contact."""
+        `near`: parts near a contact, which layers with `near` show.
+        """
         return {
             node: layer.name in self or (layer.near and part in near)
             for layer in LAYERS

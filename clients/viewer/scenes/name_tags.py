@@ -174,15 +174,10 @@ def leader_end(anchor: FloatArray, corner: FloatArray, size: FloatArray) -> Floa
 
 
 def names_of_image(world: World, top_mm: float | None = None) -> list[Name]:
-    """List the names X-ray source, sample and detector with their places [m]; "detector"
-    is beside the panel's center.
+    """List the names X-ray source, sample and detector with their places [m].
 
-    The sample's place is above its origin, so that its name does not cover it where the
-    camera is near; "detector" is a quarter of the image's width to the side.
-
-    Args:
-        world: the machine's pose.
-        top_mm: height of the sample's highest point; None is its origin's.
+    The sample's is at its top, `top_mm` (None: its origin), so as not to cover it; the
+    detector's a quarter of the image's width aside.
     """
     sample = np.array(world.sample.shift)
     if top_mm is not None:

@@ -96,10 +96,9 @@ class PlanDrawing:
     def orbit(
         self, clients: Sequence[viser.ClientHandle], points: FloatArray | None
     ) -> None:
-        """Show some clients the focal spot's path as the sample sees it; None: no longer.
+        """Show some clients the focal spot's path (n, 3) [mm], object frame.
 
-        A former path is replaced; fewer than two points show none.
-        `clients`: that see it; `points`: (n, 3) [mm], object frame.
+        It replaces a former path; None removes that.
         """
         if points is None:
             steps = None

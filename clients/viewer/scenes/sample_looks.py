@@ -92,10 +92,9 @@ class SampleLook:
         return tuple(_hull(skin.vertices) for skin in self.skins)
 
     def _reach(self, axes: int) -> float | None:
-        """Compute the greatest distance of the skins from the origin along the first
-        `axes` axes [mm]; None without skins.
-
-        With 3 axes it is the distance from the origin, with 2 that from the z axis."""
+        """Compute the skins' reach [mm] from the origin (axes: 3), or from the z axis
+        (2).
+        """
         far = [
             np.linalg.norm(skin.vertices[:, :axes], axis=1).max() for skin in self.skins
         ]
@@ -143,11 +142,10 @@ class MeshCache:
         self._keep(sample, made)
 
     def look(self, sample: SampleState) -> SampleLook:
-        """Return the look of a sample: its own meshes if known, a box of its size if not,
-        `NOTHING` for an empty stage.
+        """Return the look of a sample: its own meshes, or a box of its size.
 
-        No sample has the empty look. A named phantom is loaded and kept at its first use;
-        a body that cannot be loaded is a box, too.
+        An empty stage is `NOTHING`. A named phantom is loaded at its first use; one that
+        cannot be loaded is a box.
         """
         if sample.name is None:
             return NOTHING

@@ -60,11 +60,9 @@ class Shape:
 
 
 def cut(pieces: Iterable[PaintedMesh]) -> list[Shape]:
-    """Convert painted meshes [mm] to shapes [m]; triangles of a large mesh are first
-    divided, as they may reach behind the eye.
+    """Convert painted meshes [mm] to opaque shapes [m], in order.
 
-    A mesh is large if a side of its box exceeds `LARGE_MM`, which is then the longest
-    edge. Shapes are opaque and lit, in the meshes' order.
+    Large triangles (`LARGE_MM`) are divided, as they may reach behind the eye.
     """
     out = []
     for piece in pieces:

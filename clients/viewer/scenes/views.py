@@ -102,11 +102,10 @@ class Fitted:
     around: FloatArray
 
     def at(self, aspect: float) -> Standpoint:
-        """Choose a pane's camera: of those that hold all points, the one nearest to the
+        """Choose a pane's camera: of those that hold all points, the nearest to the
         middle.
 
-        The aspect is limited to `MIN_ASPECT` to `MAX_ASPECT`. `aspect`: the pane's width
-        over its height.
+        `aspect`: width over height.
         """
         cameras = [
             fitted(self.points, way, self.fov, self.around, aspect) for way in self.ways

@@ -91,10 +91,10 @@ class World:
         return self.view.piercing_points().reshape(2)
 
     def pixel(self, column: float, row: float) -> FloatArray:
-        """Compute the center of a pixel (column, row), in the world's frame, (3,) [mm].
+        """Compute the center of a pixel in the world's frame, (3,) [mm].
 
-        The first pixel is (0, 0), at the top left; parts of pixels and places outside the
-        image are allowed."""
+        The first one is (0, 0), at the top left.
+        """
         rows, cols = self.shape
         across = column - (cols - 1) / 2
         down = row - (rows - 1) / 2
@@ -107,11 +107,7 @@ class World:
 
 
 def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:
-    """Convert the wire's camera settings to the twin's, with the detector modes of the
-    machine.
-
-    Exposure is in ms; averages and frames are numbers of images.
-    """
+    """Convert the wire's camera settings to the twin's, with the machine's modes."""
     return CameraSettings(
         camera.mode,
         Roi(*camera.roi),
@@ -195,12 +191,11 @@ def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
 def beads_on(
     cone_vec: Sequence[float], beads: FloatArray, world: World, shape: tuple[int, ...]
 ) -> list[list[float]]:
-    """Project bead centers into an image of geometry `cone_vec` (object's frame).
+    """Project bead centers (k, 3) [mm], sample's frame, into an image of `cone_vec`.
 
-    Bead order is kept; beads outside the image, by more than half a pixel, are left out. Pixel
-    centers are whole numbers. `cone_vec`: twelve numbers, with the correction in force; `beads`:
-    (k, 3) [mm], the sample's own frame; `world`: pose of the sample on the stage; `shape`:
-    (rows, cols) of the image. Returns those within the image, (column, row) in pixels."""
+    Returns those within the image, in order, (column, row) [px]; centers of pixels are
+    whole numbers. `cone_vec`: twelve numbers, with the correction in force.
+    """
     points = world.stage.inverse @ world.sample @ beads
     rows = shape[0]
     cols = shape[1]

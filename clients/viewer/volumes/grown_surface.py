@@ -152,17 +152,13 @@ def surface(
 ) -> dict[str, Any]:
     """Find the surface of the dense parts, for the scenes.
 
-    The volume is averaged over cubes so that its longest side has at most `cells`, NaN counting
-    as 0; Otsu's threshold of that, cut to `shown_range` as a page's histogram, gives the
-    level: a few dense beads do not set it. The cubes grow twofold until there are at
-    most `MAX_FACES` faces. Voxels beyond whole cubes are left out; the border is padded with the
-    least value, so the mesh is closed.
+    Means over cubes, at most `cells` along the longest side (NaN is 0), are cut at Otsu's
+    threshold of `shown_range`: a few dense beads do not set it. The cubes grow twofold
+    until there are at most `MAX_FACES` faces. The border is padded with the least value,
+    so the mesh is closed.
 
-    `grown`: (y, x, z) [1/mm]; not a number where no data cover. `voxel_mm` and `center_mm`: of
-    the volume (x, y, z), as `Volume` has them. `cells`: along the longest side of the search
-    grid.
-    Returns `vertices` (v, 3) float32 [mm, object frame] and `faces` (f, 3) int32, both base64;
-    empty where nothing is dense.
+    `grown`: (y, x, z) [1/mm]; `voxel_mm`, `center_mm`: (x, y, z). Returns `vertices` (v,
+    3) float32 [mm, object frame] and `faces` (f, 3) int32, both base64.
     """
     factor = max(1, -(-max(grown.shape) // cells))
     while True:

@@ -158,11 +158,9 @@ class Held:
         self.say()
 
     def hold(self, data: Float32Array, grid: Volume) -> None:
-        """Store a volume (nz, ny, nx), from which requests get slices, and its size for their
-        answers.
+        """Store a volume (nz, ny, nx) and its size for answers.
 
-        Other volumes are dropped. Only the largest of the three voxel sides [mm] is sent;
-        nothing is printed.
+        The largest voxel side [mm] is sent.
         """
         self.grid = grid
         self.volumes = {"volume": data}
@@ -301,11 +299,9 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
 
 
 def _share(held: Held, name: str) -> Callable[[float, float], None]:
-    """Make a progress callback (done, whole) that reports done / whole under a name by
-    `held.say`.
+    """Make a progress callback (done, whole) that reports the share under a name.
 
-    The first call is reported, later ones at most every `TELL_S` seconds, the last one
-    like any other.
+    At most every `TELL_S` seconds.
     """
     told = -TELL_S
 
@@ -340,12 +336,9 @@ def _saturated(data: DataSet) -> float | None:
 
 
 def _facts(data: DataSet) -> dict[str, Any]:
-    """Collect a data set's facts for people; unknown ones are empty.
+    """Collect a data set's `sample`, `started` (YYYY-MM-DD HH:MM) and `kV`, for people.
 
-    `sample` and `started` are "" without the scan's document, `kV` is None without settings.
-    Times are formatted YYYY-MM-DD HH:MM; kV is the tube's voltage.
-
-    Returns `sample`, `started` and `kV`.
+    Texts are "" without the scan's document, `kV` None without settings.
     """
     settings = data.settings
     document = data.document
@@ -406,10 +399,7 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
 
 
 def _wait(path: Path, alive: Callable[[], bool]) -> None:
-    """Wait until a file is there; raises SystemExit(0) once the parent process has ended.
-
-    It looks every `LOOK_S` seconds.
-    """
+    """Wait until a file is there; SystemExit(0) once the parent ended."""
     while not path.is_file():
         if not alive():
             raise SystemExit(0)
@@ -476,11 +466,9 @@ def answer(held: Held, served: Served, asked: list[str]) -> None:
 
 
 def _told(held: Held, work: Callable[[], object], problem: str = "problem") -> None:
-    """Do work, and report an error of any kind as `problem`, so that the page does not
-    wait for ever; unexpected errors with their type. Nothing is raised.
+    """Do work, and keep an error of any kind as `problem`, raising none.
 
-    It is stored with the facts and printed. TwinError, OSError and ValueError are
-    reported by their text alone.
+    So the page does not wait for ever. Unexpected errors have their type.
     """
     try:
         work()
@@ -514,11 +502,10 @@ def main() -> None:
     held = Held(served.say, about)
 
     def work() -> None:
-        """Reconstruct a past (complete) data set, or follow one that grows, on one
-        thread, until the parent process ends.
+        """Reconstruct a past data set, or follow a growing one.
 
-        Only a growing one uses one thread and ends with the parent; a past one uses all
-        threads."""
+        That uses one thread, and ends with the parent process.
+        """
         if past:
             reconstruct(held, Path(folder), int(side))
             return

@@ -58,13 +58,9 @@ class LiveReconstruction:
             self._spare = asyncio.create_task(_started())
 
     def grow(self, folder: Path, side: int, past: bool = False) -> None:
-        """Start the volume of a data set and end any other; for the same request only
-        send its newest line again, if there is one.
+        """Start the volume of a data set, `side` voxels a side, and end any other.
 
-        Args:
-            folder: of the data set.
-            side: number of voxels a side.
-            past: whether the scan is complete.
+        The same request only gets its newest line again. `past`: the scan is complete.
         """
         asked = wish(folder, side, past)
         if asked == self._asked:
@@ -76,11 +72,9 @@ class LiveReconstruction:
         self._task = watched(self._follow(*asked), "a live reconstruction")
 
     def stop(self) -> None:
-        """End the running reconstruction, if there is one, and forget the request;
-        its task is canceled, not waited for.
+        """End the running reconstruction, not waiting for it, and forget the request.
 
-        Open requests are canceled (`ask` returns None), and the newest line is cleared.
-        `close` waits for the end.
+        Open requests give None.
         """
         if self._task is not None:
             self._task.cancel()

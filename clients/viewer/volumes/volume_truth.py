@@ -116,14 +116,10 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
 def _seen(
     like: Volume, back: FloatArray, shift: FloatArray, margin: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute the box of a phantom, low and high corner (3,) [mm], that a grid holds, with a
-    margin [mm] around it.
+    """Compute the box (low and high corner [mm]) of a phantom that a grid holds.
 
-    Args:
-        like: the grid.
-        back: (3, 3), turn of the stage's frame to that of the phantom.
-        shift: (3,), place of the phantom's origin on the stage [mm].
-        margin: around the box [mm].
+    `back`: (3, 3) turn from the stage's frame to the phantom's; `shift`: its place on the
+    stage [mm].
     """
     half = np.array(like.shape[::-1]) * like.voxel_xyz / 2
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -132,10 +128,7 @@ def _seen(
 
 
 def _means_of_pairs(data: Float32Array, axis: int) -> Float32Array:
-    """Compute the means of neighbors along an axis, one fewer than there are.
-
-    The input is not changed; data have at least one entry along `axis`.
-    """
+    """Compute the means of neighbors along an axis, one fewer than there are."""
     along = np.moveaxis(data, axis, 0)
     means = along[:-1] + along[1:]
     means *= np.float32(0.5)
@@ -229,21 +222,15 @@ def main_level(truth: Float32Array) -> float:
 def extent(
     values: Float32Array, truth: Float32Array, axis: int, seen: float, mu: float
 ) -> float:
-    """Measure the extent from one face to the other along an axis, where the truth is
-    widest [voxels].
+    """Measure the extent from face to face along an axis, where the truth is widest
+    [voxels].
 
-    The profile is the median over all lines that meet both faces, so that neither noise
-    nor streaks count, and is followed to half of the material's attenuation, between two
-    voxels. nan where the truth has no solid voxel or the profile never exceeds half of
-    `seen`. Lines within one voxel of the widest extent are used; the result is the
-    profile's width at half of `seen`, interpolated.
+    The profile is the median over all lines within a voxel of the widest, so that neither
+    noise nor streaks count; its width is at half of `seen`, interpolated. nan without a
+    solid voxel of the truth, or where the profile never exceeds that.
 
-    Args:
-        values: measured, or the truth itself.
-        truth: with the faces.
-        axis: of both arrays.
-        seen: attenuation of the main material in `values` [1/mm].
-        mu: the same in `truth` [1/mm].
+    `values`: measured, or the truth; `seen`: its main material's attenuation [1/mm], `mu`
+    in the truth.
     """
     solid = np.moveaxis(truth, axis, -1) > mu / 2
     there = solid.any(axis=-1)

@@ -64,11 +64,11 @@ class Room(NamedTuple):
 
 
 def room_of(machine: Machine) -> Room:
-    """Compute the `Room` of a machine: corners of the box that its parts can reach [mm],
-    its scale over the FleX-ray, and the floor's height [mm].
+    """Compute the `Room` of a machine: box of its parts' reach, scale, and floor [mm].
 
-    The scale is the smaller ratio of horizontal and vertical reach to `DRAWN_FOR_MM`; the
-    floor lies `BELOW_MM` times the scale below the lowest part."""
+    The scale is the smaller ratio of reach to `DRAWN_FOR_MM`, across or up; the floor
+    lies `BELOW_MM` times it lower.
+    """
     low, high = reach_of(machine)
     across = (high - low)[:2].max()
     tall = (high - low)[2]

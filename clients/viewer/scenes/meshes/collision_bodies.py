@@ -16,10 +16,9 @@ the axes too."""
 
 
 def bare(solid: ConvexSolid) -> trimesh.Trimesh:
-    """Build the mesh of an upright cylinder or polytope, without margin [mm].
+    """Build the mesh of an upright cylinder (48 sides) or polytope [mm].
 
-    An upright cylinder becomes a mesh of 48 sides, a polytope the convex hull of its
-    vertices; another solid fails an assertion.
+    Another solid fails an assertion.
     """
     if isinstance(solid, UprightCylinder):
         size = 2.0 * solid.radius, solid.height

@@ -74,10 +74,7 @@ def cylinder(
     axis: str = "z",
     sections: int = 48,
 ) -> PaintedMesh:
-    """Build a cylinder about an axis through its center, as a painted mesh [mm].
-
-    `diameter`: [mm]; `height`: along its axis [mm]; `center`: [mm]; `paint`: color and gloss;
-    `axis`: "z" or "y"; `sections`: sides of the mesh."""
+    """Build a painted cylinder about an axis ("z", "y") through its center [mm]."""
     mesh = trimesh.creation.cylinder(
         radius=diameter / 2, height=height, sections=sections
     )
@@ -87,10 +84,10 @@ def cylinder(
 def lathe(
     profile: Sequence[tuple[float, float]], center: Vector, paint: Paint, axis: str = "z"
 ) -> PaintedMesh:
-    """Build a body of revolution of 64 sections as a painted mesh [mm].
+    """Build a painted body of revolution about an axis ("z", "y") [mm].
 
-    `profile` holds points (radius, height) from bottom to top, relative to `center`;
-    `axis` is "z", or "y" for a body turned to lie along y."""
+    `profile`: (radius, height).
+    """
     mesh = trimesh.creation.revolve(np.asarray(profile, dtype=float), sections=64)
     return _standing(mesh, center, paint, axis)
 
@@ -98,10 +95,7 @@ def lathe(
 def _standing(
     mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str
 ) -> PaintedMesh:
-    """Turn a mesh made about z, move it to its center and paint it.
-
-    The mesh is changed in place: turned by -90 degrees about x (z becomes y) only if
-    `axis` is "y", then moved by `center` (x, y, z) [mm]."""
+    """Turn a mesh made about z, in place, move it to its center [mm] and paint it."""
     if axis == "y":
         mesh.apply_transform(turn_matrix((1, 0, 0), -np.pi / 2))
     mesh.apply_translation(center)

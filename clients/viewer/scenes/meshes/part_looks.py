@@ -36,14 +36,10 @@ LOOKS: Final[Mapping[str, Any]] = tomllib.loads(_TABLE.read_text(encoding="utf-8
 
 
 def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
-    """Read the parts' own meshes as GLB files [m].
+    """Read the parts' own meshes as GLB files [m], part -> file.
 
-    A .glb file is passed on unchanged, with its colors; any other mesh [mm] is painted
-    `ALUMINIUM` and encoded as GLB [m]. Parts without a mesh are left out.
-
-    `machine`: with the parts; `folder`: of its machine file and the meshes.
-    Returns part -> GLB file, for those that have a mesh.
-    Raises PhantomError: a file cannot be read any more.
+    A .glb file is passed on unchanged; any other mesh [mm] is painted `ALUMINIUM`. Raises
+    PhantomError: a file cannot be read any more.
     """
     looks = {}
     for part in machine.components:
