@@ -217,7 +217,7 @@ def _mesh(phantom: Phantom, surface: Surface, made_of: Material) -> Body:
 
 
 def _find(name: str) -> Material | None:
-    """Look up a material; None if it is unknown."""
+    """Look up a material; None if it is unknown, LimitError for a wrong formula."""
     try:
         return material(name)
     except UnknownNameError:

@@ -629,10 +629,9 @@ def encoded(result: object, codec: Codec) -> Encoded:
 
 
 def _body(codec: Codec, message: Message) -> list[bytes]:
-    """Encode a message without framing, in pieces; an `Encoded` result of this codec as
-    it is.
+    """Encode a message without framing; an `Encoded` result of this codec as it is.
 
-    Raises what `to_plain` does.
+    Raises ValueError, TypeError, OverflowError.
     """
     match message:
         case Response(id, Encoded(pieces)):

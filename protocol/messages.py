@@ -380,9 +380,9 @@ class Correlation(Generic[_W]):
         return Request(id, method, dict(params))
 
     def abandon(self, request: Request, *, sent: bool = True) -> None:
-        """Stop waiting for an answer, to be dropped.
+        """Stop waiting for an answer; one that still comes is dropped.
 
-        Not `sent`, an answer would be a violation.
+        If it was not `sent`, an answer would be a violation.
         """
         if not sent:
             self._open_requests.pop(request.id, None)

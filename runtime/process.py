@@ -343,8 +343,8 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
     a TwinError, ValueError or an OSError of a file, REFUSED after another; others are
     raised.
 
-    SIGINT, unless ignored, ends the process until the work calls `stop_signal`, before it
-    is ready: an exception within asyncio's loop can lose the turn of a task.
+    Until the work calls `stop_signal`, before it is ready, SIGINT (unless ignored) ends
+    the process at once: an exception within asyncio's loop can lose the turn of a task.
     """
     _allow_descriptors()
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:

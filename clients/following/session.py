@@ -81,11 +81,11 @@ class FollowSession:
         self._midnight = self.clock() - (now - midnight).total_seconds()
 
     def message(self, data: bytes, at: float | None = None, late_s: float = 0.0) -> None:
-        """Take one message, which came within `late_s` before `at` (None: now): record
-        it, update the mirror, report alarms and executed lines.
+        """Take one message, which came within `late_s` before `at` [s] (None: now).
 
-        Messages that are no events are counted in `unread`, the first an example.
-        Executed lines go to `executed`, alarms to `tell`, changes to `changed`.
+        It is recorded, and updates the mirror. Messages that are no events are counted in
+        `unread`, the first an example. Executed lines go to `executed`, alarms to `tell`,
+        changes to `changed`.
         """
         if at is None:
             at = self.clock()

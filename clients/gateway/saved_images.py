@@ -171,7 +171,10 @@ class Recording:
                 self._write_texts()
 
     def close(self) -> None:
-        """Close the folder, once a saving has ended; a later one raises."""
+        """Close the folder, once a saving has ended.
+
+        A later one raises DatasetError.
+        """
         with self._turn:
             self._closed = True
             if self._folder is not None:

@@ -14,9 +14,9 @@ _confined: Directory | None = None
 
 @contextmanager
 def confined(root: Directory) -> Iterator[None]:
-    """Read nothing through a link below `root` in the context.
+    """Let this process read nothing through a link below `root` in the context.
 
-    Strangers may request paths.
+    Strangers request paths of servers.
     """
     global _confined
     before = _confined

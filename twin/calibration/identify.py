@@ -580,7 +580,7 @@ def _rounds(
 def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, int]:
     """Compute mean squared distances [px^2] of spots to beads `predicted` (n, k, 2).
 
-    Missing pairs count as the cap. Returns also the spots explained.
+    Missing pairs count as the `cap` [px]. Returns also the number of spots explained.
     """
     index = assign(predicted, shadows.points, shadows.counts, cap)
     matches = int(np.count_nonzero(index >= 0))

@@ -232,7 +232,7 @@ class PairStack:
 
         Motors that carry both bodies of a pair cancel; turning bodies count at every
         angle. Bodies are bounded by boxes; where these may overlap it is 0. `lower`,
-        `upper`: (..., axes) positions.
+        `upper`: (..., axes) [mm, deg].
         """
         shape = (*lower.shape[:-1], len(self.pairs), 3)
         middle = (0.5 * (lower + upper) @ self.slides).reshape(shape) + self.offset

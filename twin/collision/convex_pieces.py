@@ -187,7 +187,7 @@ def _led_by(triangles: FloatArray, height: FloatArray, sign: float) -> FloatArra
 
 
 def _crossing(start: FloatArray, end: FloatArray, axis: int, at: float) -> FloatArray:
-    """Compute where edges `start` to `end` (n, 3) cross a plane of `axis`.
+    """Compute where edges `start` to `end` (n, 3) cross a plane of `axis` at `at` [mm].
 
     None may be parallel to it.
     """

@@ -291,13 +291,10 @@ def _nearest(
 
 
 def separation_at(scene: CollisionScene, pair: Pair, q: FloatArray) -> float:
-    """Compute the certified clearance [mm] of a pair with the motors at `q` (axes,); 0 for an
+    """Compute the certified clearance [mm] of two bodies with the motors at `q`; 0 for an
     overlap.
 
-    It is never more than the true distance.
-
-    `scene`: the bodies; `pair`: indices of two; `q`: (axes,) positions [mm, deg].
-    Returns clearance, never more than the true distance.
+    It is never more than the true distance. `pair`: indices; `q`: (axes,) [mm, deg].
     """
     a, b = (scene.bodies[i] for i in pair)
     offset = q @ (a.slides - b.slides) + (a.origin - b.origin)

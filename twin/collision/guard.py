@@ -62,7 +62,7 @@ class SceneGuard:
         return Contact(pair, now, here, here, now, near[pair], free_before=False)
 
     def standing(self, positions: Mapping[str, float]) -> SceneGuard:
-        """Return a guard with the turntable's stages fixed where they are.
+        """Return a guard with the turntable's stages fixed at positions [mm, deg].
 
         Contacts are then this pose's.
         """

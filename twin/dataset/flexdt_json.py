@@ -620,7 +620,7 @@ class DatasetDocument(_Model):
     def positions(self, kind: FrameKind = "projection") -> dict[str, FloatArray]:
         """Collect the motor positions of frames of one kind: motor -> (n,) [mm, deg].
 
-        Motors are the first frame's; {} without frames.
+        Motors are the first frame's; KeyError if a later one lacks one.
         """
         chosen = [f.positions for f in self.frames if f.kind == kind]
         return {

@@ -901,7 +901,7 @@ class Machine(_Frozen):
         return self.virtual_axes[axis].moves
 
     def counts(self, motor: str) -> float:
-        """Return the units of a motor that move the part it moves farthest by 1."""
+        """Return by how many units a motor moves the farthest part by 1 mm or deg."""
         shares = (abs(of.get(motor, 0.0)) for of in self.geometry.values())
         return 1.0 / (max(shares, default=0.0) or 1.0)
 

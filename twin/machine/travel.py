@@ -55,7 +55,8 @@ class Arrival:
 
 
 def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arrival:
-    """Apply the rule for targets beyond a limit to a move of `axis`; raises nothing.
+    """Apply the rule for targets [mm, deg] beyond a limit to a move of `axis`; raise
+    nothing.
 
     Beyond is by more than `POSITION_ROUNDING`; motors of a virtual axis are shortened
     together (`clamp`). Returns targets within the travel, a message for each beyond, and

@@ -179,7 +179,7 @@ def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
 def braked_at(
     drives: Drives, at: float, trajectories: Mapping[str, Trajectory], most: Most
 ) -> dict[str, Drive]:
-    """Return drives that follow `trajectories` up to `at` and then brake along their
+    """Return drives that follow `trajectories` up to `at` [s] and then brake along their
     path.
 
     A trajectory replaces all that its motor was to follow; one with nothing left to do is

@@ -163,7 +163,7 @@ def plan_move(
     relative: bool = False,
     shortest: bool = False,
 ) -> dict[str, Trajectory]:
-    """Plan the motions to `targets` of the motors that these move; all begin now.
+    """Plan the motions to `targets` of the motors that these move; all begin `now` [s].
 
     Motors of a virtual axis get paces in proportion, so that from rest they keep in step;
     acceleration is at least that in force. `relative`: displacements from where motors

@@ -145,7 +145,7 @@ class Trajectory:
     def acceleration(self, time: float) -> float:
         """Return the largest absolute acceleration from `time` on [mm/s2, deg/s2].
 
-        Before the start of the whole motion; after the end 0.
+        Before the start it is that of the whole motion; after the end 0.
         """
         if time >= self.end:
             return 0.0
@@ -236,7 +236,7 @@ class AxisPath(ArrayValue):
     def of(
         cls, start: float, trajectories: Sequence[tuple[float, Trajectory]]
     ) -> AxisPath:
-        """Join (time, trajectory) in order, after rest at `start`."""
+        """Join (time, trajectory) in order, after rest at `start` [mm, deg]."""
         return cls.along(joined([at_rest(start), *(later for _, later in trajectories)]))
 
     @classmethod

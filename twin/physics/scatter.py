@@ -573,7 +573,9 @@ def way_of(rows: FloatArray) -> FloatArray:
 
 
 def _views_to_simulate(way: FloatArray, step: float) -> Sequence[int]:
-    """Choose the views to simulate, ascending: first, last, paths at most `step`."""
+    """Choose the views to simulate, ascending: first, last, at most `step` of path
+    apart.
+    """
     chosen = [0]
     for i in range(1, len(way)):
         if i == len(way) - 1 or way[i + 1] - way[chosen[-1]] > step:

@@ -255,9 +255,11 @@ class BiasOfIterations(BiasOnDemand):
         return out
 
     def _sampling(self, bounded: Bias) -> FloatArray:
-        """Compute what pixels and voxels do that stand for what is between them: the algorithm
-        gets a volume's images, and those of one of voxels twice as large, on the grid of the
-        latter. The difference falls with the voxels as that of pixels does."""
+        """Compute the errors by the sampling of voxels, and of pixels as for FDK, (nz, ny, nx).
+
+        The algorithm reconstructs a volume's images, and those of the same with voxels twice
+        as large, on the grid of the latter; the difference is scaled to the scan's voxels.
+        """
         scan = self._copied(FINE_NODES)
         half = scan.halved
         rows, cols = half.images.shape[1:]

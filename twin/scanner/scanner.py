@@ -447,7 +447,7 @@ class ScannerTwin:
         self.safety = rules.released(self._safety_at(now), stop)
 
     def place(self, positions: Mapping[str, float], now: float) -> None:
-        """Set motors to known positions at rest, at once: a start, not a motion.
+        """Set motors to positions [mm, deg] at rest, at once: a start, not a motion.
 
         Others rest where their motion would have ended. Nothing is swept; touching parts
         block the scanner. Raises UnknownNameError, LimitError: nothing is changed.

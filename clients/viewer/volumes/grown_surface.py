@@ -152,13 +152,14 @@ def surface(
 ) -> dict[str, Any]:
     """Find the surface of the dense parts, for the scenes.
 
-    Means over cubes, at most `cells` along the longest side (NaN is 0), are cut at Otsu's
-    threshold of `shown_range`: a few dense beads do not set it. The cubes grow twofold
-    until there are at most `MAX_FACES` faces. The border is padded with the least value,
-    so the mesh is closed.
+    Means over cubes are taken, at most `cells` along the longest side (NaN counts as 0),
+    and cut at Otsu's threshold of them, limited to `shown_range`: a few dense beads do
+    not set it. The cubes grow twofold until there are at most `MAX_FACES` faces. The
+    border is padded with the least mean, so the mesh is closed.
 
     `grown`: (y, x, z) [1/mm]; `voxel_mm`, `center_mm`: (x, y, z). Returns `vertices` (v,
-    3) float32 [mm, object frame] and `faces` (f, 3) int32, both base64.
+    3) float32 [mm, object frame] and `faces` (f, 3) int32, both base64; empty without
+    dense parts.
     """
     factor = max(1, -(-max(grown.shape) // cells))
     while True:

@@ -466,9 +466,10 @@ def answer(held: Held, served: Served, asked: list[str]) -> None:
 
 
 def _told(held: Held, work: Callable[[], object], problem: str = "problem") -> None:
-    """Do work, and keep an error of any kind as `problem`, raising none.
+    """Do work, and keep an error of any kind as `problem`, with its type if it is
+    unexpected.
 
-    So the page does not wait for ever. Unexpected errors have their type.
+    So the page does not wait for ever. TwinError, OSError and ValueError are expected.
     """
     try:
         work()

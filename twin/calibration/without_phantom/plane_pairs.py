@@ -213,7 +213,8 @@ class PlanePairs:
     def _own(self, rest: FloatArray) -> FloatArray:
         """Subtract from pairs' differences (q, k) the mean over all pairs as far apart.
 
-        It is what stays on the panel; planes of a body of revolution have none.
+        So what stays on the panel is lost; planes of a body of revolution agree at any
+        height.
         """
         total = np.add.reduceat(rest * self.valid, self.starts, axis=0)
         count = np.add.reduceat(self.valid, self.starts, axis=0, dtype=np.intp)

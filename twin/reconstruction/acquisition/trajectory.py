@@ -426,7 +426,7 @@ def _unseen(gaps: FloatArray, widest: float) -> float:
 
 
 def reach(fan: FloatArray) -> tuple[float, float]:
-    """Compute the fan angles (n, cols) that all views have, clockwise and not, both
+    """Compute how far all fans (n, cols) reach [rad], clockwise and not, both
     positive.
     """
     return -float(fan.min(axis=1).max()), float(fan.max(axis=1).min())

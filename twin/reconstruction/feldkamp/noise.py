@@ -73,8 +73,8 @@ class Noise:
     shared: FloatArray
 
     def sigma(self, grid: Volume) -> Float32Array:
-        """Compute the standard deviation of noise at a grid's voxels [1/mm]; NaN where it
-        is.
+        """Compute the standard deviation of noise at a grid's voxels [1/mm]; NaN where
+        its values are.
 
         The views' own variance, interpolated, plus what they share by distance from the
         axis. A mean over rows: near the axis one on a row has 1.2 times as much, between

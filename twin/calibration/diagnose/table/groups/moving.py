@@ -201,8 +201,8 @@ def _kinds(count: int) -> Iterator[tuple[str, list[int], FloatArray]]:
 def apart(courses: Iterable[tuple[object, FloatArray]]) -> dict[str, float]:
     """Name what differs between scans because it jumps, wanders or drifts in one of them.
 
-    `courses`: each group of motion's place, and course over the frames. Returns widths,
-    its range.
+    `courses`: each group of motion's place, and course over the frames. Returns name ->
+    width, the course's range.
     """
     out: dict[str, float] = {}
     for place, course in courses:
