@@ -201,7 +201,7 @@ class Page:
     def say(self, kind: str, **content: object) -> None:
         """Send something that must arrive, in order, as JSON.
 
-        A page with `MAX_NOTES` unsent is closed.
+        A page with more than `MAX_NOTES` unsent is closed.
         """
         self._notes.append(json.dumps({"type": kind, **content}))
         if len(self._notes) > MAX_NOTES:

@@ -120,9 +120,10 @@ def counts_behind(
     view: npt.ArrayLike,
     pixels_a_side: int = 1,
 ) -> Float32Array:
-    """Predict the counts above dark without noise, (rows, cols), not clipped.
+    """Predict the counts above dark of camera pixels, (rows, cols), not clipped.
 
-    `paths_mm`: (m, rows, cols), of each substance; `pixels_a_side`: camera pixels.
+    `pixels_a_side`: of the camera, along each side of a pixel of `paths_mm` (m, rows,
+    cols).
     """
     charge = expected_signal(chain, paths_mm, view, exposure).mean_e
     return expected_counts(chain.panel, camera, charge / np.float32(pixels_a_side**2))

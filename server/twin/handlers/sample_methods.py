@@ -266,11 +266,11 @@ def _ensure_unused(twin: TwinServer, name: str) -> None:
 
 
 def _ensure_replaceable(twin: TwinServer, client: h.Client, name: str) -> None:
-    """Check that a file may come under a name: with control, while nothing moves on the
-    stage.
+    """Check that a file may replace another of its name: with control; on the stage, at
+    rest.
 
     Control is taken where it is free. A scan that has begun with the file there would be
-    refused. Raises RpcError: -32003.
+    refused from then on. Raises RpcError: -32003.
     """
     if twin.samples.head(name) is not None:
         before = twin.control.holder

@@ -318,9 +318,10 @@ def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFoun
 
 
 def _closes(found: Symmetry, gap: Gap) -> bool:
-    """Check whether a converged fit shows that there is no gap (its width is 0).
+    """Check whether the fit shows no gap: it converged, and leaves no width above
+    `SIGMAS`.
 
-    It is known twice as well as by its prior; False beside the axis.
+    The width must be known twice as well as by its prior; False beside the axis.
     """
     if gap.beside_axis:
         return False

@@ -45,8 +45,8 @@ def read_nxtomo(
 
     In place of its own: `geometry`, one view a projection; else `distances` to axis and
     panel [mm], unless it has cone_vec; `angles` [deg], where it has none. Raises
-    DatasetFormatError: no NXtomo, images or geometry, or contradictions; TwinError: h5py
-    is missing.
+    DatasetMissingError; DatasetFormatError: no NXtomo, images or geometry, or
+    contradictions; TwinError: h5py is missing.
     """
     try:
         with hdf5_file(path, "NXtomo") as file:
