@@ -21,7 +21,7 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
     judge_held,
     judge_priors,
     loosened,
-    narrow_priors,
+    narrow_priors_warning,
 )
 from flexdt.twin.calibration.diagnose.table.group import Known
 from flexdt.twin.calibration.diagnose.table.groups.told import DISTANCE, pitch_beside
@@ -200,7 +200,7 @@ def check_fixed(
         return fit, [*left, verdict.finding]
     found = listed(verdict.lengths)
     if verdict.factor > 1.0:
-        found.append(narrow_priors(verdict))
+        found.append(narrow_priors_warning(verdict))
         given = {**asked.priors, **priors_of(state.scans, asked, state.model)}
         asked = replace(asked, priors=loosened(given, verdict.factor))
     before = fit

@@ -504,7 +504,7 @@ def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
 
 def _predicted(problem: FitProblem, x: FloatArray) -> FloatArray:
     """Predict spots (n, k, 2) from the image's center [px]."""
-    return problem.residuals(x)[0] - problem.origin[:, None, :]
+    return problem.predictions(x)[0] - problem.origin[:, None, :]
 
 
 def _followed(

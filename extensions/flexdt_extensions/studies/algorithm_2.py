@@ -105,7 +105,7 @@ def algorithm_2(problem: FitProblem, lam: float = 1e-2) -> Algorithm2:
         the geometry is impossible.
         """
         try:
-            predicted = problem.residuals(x / unit)[0] - problem.origin[:, None, :]
+            predicted = problem.predictions(x / unit)[0] - problem.origin[:, None, :]
         except TwinError:
             return np.full(1, np.inf)
         return stacked(predicted, problem.measured, problem.seen, pairs)

@@ -41,7 +41,7 @@ def predictions(fit: FitResult, geometry: Sequence[Offsets]) -> FloatArray:
     for i, name in enumerate(problem.layout.names[:first]):
         if name.split("@")[0] in TOLD:
             x[i] = fit.solution.x[i]
-    return problem.residuals(x, np.ones_like(problem.seen))[0]
+    return problem.predictions(x, np.ones_like(problem.seen))[0]
 
 
 def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:

@@ -40,7 +40,7 @@ def test_kernel_projects_as_cone_vec_does(seed: int, reading: Reading) -> None:
     problem = build_problem(
         tracks, model, poses, free=NAMES, shape=SHAPE, start=truth, reading=reading
     )
-    predicted, norms = problem.residuals(problem.start)
+    predicted, norms = problem.predictions(problem.start)
     assert_allclose(predicted, tracks, atol=1e-9)
     assert norms.max() < 1e-9
     back = problem.parameters(problem.start)[0]
@@ -68,7 +68,7 @@ def test_jacobian_is_the_derivative(centre: Centre, reading: Reading) -> None:
     w = problem.whiten
 
     def whitened(value: np.ndarray) -> np.ndarray:
-        p = problem.residuals(value)[0]
+        p = problem.predictions(value)[0]
         return np.stack(
             [w[..., 0] * p[..., 0] + w[..., 1] * p[..., 1], w[..., 2] * p[..., 1]],
             axis=-1,
@@ -116,7 +116,7 @@ def test_sphere_centre_bias_against_the_outline_of_a_cone() -> None:
     problem = build_problem(
         point, model, poses, free=("dO_x",), shape=SHAPE, centre=Centre.OUTLINE
     )
-    shadow = problem.residuals(problem.start)[0][0, 0]
+    shadow = problem.predictions(problem.start)[0][0, 0]
     assert np.linalg.norm(shadow - point[0, 0]) > 0.01
     assert_allclose(
         shadow, middle, atol=2e-4 * np.linalg.norm(shadow - point[0, 0]) + 1e-6

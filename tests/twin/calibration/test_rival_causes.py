@@ -91,9 +91,9 @@ def test_the_mean_of_an_arc_is_that_of_its_positions(frames: int) -> None:
     problem = build_problem(mean, model, poses, free=("dO_x",), shape=SHAPE, arc=True)
     x = problem.start
     x[problem.layout.arc_column] = share**2
-    assert problem.residuals(x)[0] == pytest.approx(mean, abs=0.3 / frames**2 * 12)
+    assert problem.predictions(x)[0] == pytest.approx(mean, abs=0.3 / frames**2 * 12)
     assert (
-        np.abs(problem.residuals(problem.start)[0] - mean).max()
+        np.abs(problem.predictions(problem.start)[0] - mean).max()
         > 20 * 0.3 / frames**2 * 12
     )
 
@@ -122,8 +122,8 @@ def test_each_position_is_that_of_the_time_at_which_its_row_is_read(
     x = problem.start
     x[problem.layout.rows_column] = share
     # What is left grows with the fourth power of the arc: of 5 deg at most.
-    assert problem.residuals(x)[0] == pytest.approx(seen, abs=1e-3)
-    assert np.abs(problem.residuals(problem.start)[0] - seen).max() > 0.5
+    assert problem.predictions(x)[0] == pytest.approx(seen, abs=1e-3)
+    assert np.abs(problem.predictions(problem.start)[0] - seen).max() > 0.5
 
 
 def test_rows_that_are_read_over_a_long_turn_are_no_other_phantom() -> None:
@@ -153,7 +153,7 @@ def test_slopes_of_rows_are_those_of_positions(strained: bool) -> None:
         ahead, behind = x.copy(), x.copy()
         ahead[i] += step
         behind[i] -= step
-        moved = problem.residuals(ahead)[0] - problem.residuals(behind)[0]
+        moved = problem.predictions(ahead)[0] - problem.predictions(behind)[0]
         assert slopes[:, i] == pytest.approx(
             moved.ravel() / (2 * step), abs=1e-3, rel=1e-4
         )

@@ -469,7 +469,7 @@ def doubtful(
     return fit
 
 
-def narrow_priors(judged: PriorsJudged) -> Finding:
+def narrow_priors_warning(judged: PriorsJudged) -> Finding:
     """Make the warning that all priors are widened by the factor of `judged`, with the
     causes that alone would explain it, if any.
     """

@@ -38,7 +38,7 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> list[
     % of the frames. Returns a finding a scan at most.
     """
     group = np.repeat(np.arange(len(looks)), [len(some) for some in looks])
-    predicted = fit.problem.residuals(fit.solution.x)[0]
+    predicted = fit.problem.predictions(fit.solution.x)[0]
     out: list[Finding] = []
     for scan, some in enumerate(looks):
         detections = [
@@ -145,7 +145,7 @@ def _aside(fit: FitResult, frames: Sequence[int]) -> FloatArray | None:
     the distances (what turns moves shadows of near and far beads apart), or for fewer than
     `LEAST_ASIDE` spots.
     """
-    off = (fit.problem.pixels - fit.problem.residuals(fit.solution.x)[0])[list(frames)]
+    off = (fit.problem.pixels - fit.problem.predictions(fit.solution.x)[0])[list(frames)]
     off = off[np.isfinite(off).all(axis=-1)]
     if len(off) < LEAST_ASIDE:
         return None

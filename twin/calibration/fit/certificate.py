@@ -581,7 +581,7 @@ def certify(
     rows = np.concatenate([jac[keep], np.diag(np.sqrt(weight))[weight > 0]])
     beads = int(problem.seen.any(axis=0).sum())
     noise, dof = spread_of_residuals(problem, x, use, prior_noise)
-    predicted = problem.residuals(x, use)[0]
+    predicted = problem.predictions(x, use)[0]
     residual = problem.pixels - predicted
     enlargement = correlation_length(residual, use, problem.group)
     if dof:

@@ -175,7 +175,7 @@ def solve(
         problem, value, use, how, prior_noise
     )
     for _ in range(4):
-        norms = problem.residuals(value)[1]
+        norms = problem.predictions(value)[1]
         limit = how.trim * _spread(norms[use], len(value), how.floor_px)
         keep = problem.seen & (norms <= limit)
         settled = np.array_equal(keep, use) and (norms[use] <= huber).all()
@@ -341,7 +341,7 @@ def _step(hess: FloatArray, grad: FloatArray, damping: float) -> FloatArray | No
 def cost_at(problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_]) -> float:
     """Compute half the whitened squares of `use`, no priors; inf behind the source."""
     try:
-        norms = problem.residuals(x)[1]
+        norms = problem.predictions(x)[1]
     except TwinError:
         return math.inf
     return float(0.5 * np.sum(norms[use] ** 2))

@@ -513,7 +513,7 @@ class FitProblem:
         params, _ = self.spread(x)
         return poses_at(self.poses, params[self.group])
 
-    def residuals(
+    def predictions(
         self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Predict positions [px] of all beads, (n, k, 2), and lengths of whitened
@@ -526,9 +526,9 @@ class FitProblem:
 
     def whitened(self, x: FloatArray) -> FloatArray:
         """Compute whitened residuals (n, k, 2), measured minus predicted, in the order of
-        `jacobian`; 0 where unseen. Raises as `residuals`.
+        `jacobian`; 0 where unseen. Raises as `predictions`.
         """
-        predicted = self.residuals(x)[0]
+        predicted = self.predictions(x)[0]
         w = self.whiten
         off = self.measured + self.origin[:, None, :] - predicted
         return np.stack(

@@ -386,7 +386,7 @@ def _with_groups(
         still = replace(
             every, poses=motion_of(_of_scans(plain, state)).applied(plain.poses)
         )
-        motion = every.residuals(x)[0] - still.residuals(x)[0]
+        motion = every.predictions(x)[0] - still.predictions(x)[0]
         every = replace(still, measured=every.measured - motion)
     names = {posterior.name(g) for g in posterior.best.widths}
     old = plain.layout

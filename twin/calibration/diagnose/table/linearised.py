@@ -202,7 +202,7 @@ class Linearised:
     @cached_property
     def places(self) -> FloatArray:
         """Predicted column and row of each position, (n, k, 2) [px]."""
-        return self.problem.residuals(self.state.x)[0]
+        return self.problem.predictions(self.state.x)[0]
 
     @property
     def bead_slopes(self) -> npt.NDArray[np.intp]:
