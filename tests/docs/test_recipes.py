@@ -238,7 +238,7 @@ def test_a_format_of_geometry_is_added_by_its_recipe(copy: Path) -> None:
         "docs/exchange.md": (
             ("csv,nxtomo} --out", "added,"), ("| `csv` |", "| `added` | `.added` | cone_vec | |\n"),
         ),
-        "docs/command-line.md": (("csv and back, images", "added, "),),
+        "docs/command-line.md": (("csv; images and geometry", "added, "),),
     }  # fmt: skip
     inserted(copy, changes)
     shown = run(copy, "-m", "flexdt.clients.cli", "export", "--help")

@@ -246,7 +246,7 @@ def _fitted_some(
     kept = p.copy()
 
     def model(p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the rest (n, k) and its derivatives (9, n, k)."""
+        """Return the weighted residuals (n, k), and the model's derivatives (9, n, k)."""
         d = across - p[:, 2:3] - np.einsum("ni,ink->nk", p[:, 3:8], shape)
         s = np.exp(np.clip(p[:, 8:9], -3.0, 2.0))
         q = d / s
