@@ -725,7 +725,8 @@ class Volume:
     def bias_bound(self) -> Float32Array | None:
         """Bound of each voxel's deviation without noise, (nz, ny, nx) [1/mm].
 
-        NaN without data, None if not estimated; no bound if `accuracy.cut_off`.
+        NaN without data; None if not estimated. Where `accuracy.cut_off` it is an
+        estimate.
         """
         bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
         bound: Float32Array | None

@@ -99,7 +99,7 @@ def ensure_idle(
 ) -> Callable[[], None]:
     """Return a check that raises RpcError -32003 if another client has control.
 
-    Or if a job would be disturbed, by `what`; `method` is for the error.
+    Or if a job would be disturbed. `method` and `what` are for the errors.
     """
 
     def check() -> None:

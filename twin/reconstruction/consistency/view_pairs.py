@@ -319,8 +319,8 @@ def sampling_error(images: Float32Array, noise: float) -> FloatArray:
     """Compute standard deviations (n, rows, cols) of pixels that stand for what lies
     between.
 
-    A jump bends two pixels, one off by `ROUNDING`. `noise`: a pixel's variance, which
-    bends without jumps.
+    A jump bends two pixels, one of them off by `ROUNDING`. `noise`: a pixel's variance,
+    whose second differences are no bends.
     """
     squares = np.zeros(images.shape)
     squares[:, :, 1:-1] += np.square(np.diff(images, n=2, axis=2)) - 6.0 * noise
