@@ -53,6 +53,8 @@ SECTORS = 24
 and sectors of the views that are as many patches."""
 MIN_SIGNAL_RATIO: Final = 0.5
 """Least ratio to noise of the images behind the slopes."""
+ROUNDING: Final = float(np.finfo(np.float32).eps) / math.sqrt(12.0)
+"""Noise of a line integral whose intensity, about 1, is a float32."""
 
 
 class OppositeRays:
@@ -100,14 +102,15 @@ class OppositeRays:
             NotIdentifiableError: fewer than `FEWEST_PAIRS` see a line from both ends at
                 the start; the message names a turn that would do.
         """
-        self.frames = frames
+        rounding = random.standard_normal(frames.shape, dtype=np.float32)
+        self.frames = frames + np.float32(ROUNDING) * rounding
         self.top = top
         self.shape = shape
         self.views = views
         self.start = start
         self.scales = scales
         self.known = np.diag(1.0 / np.square(priors))
-        self.noise = noise_like(frames.transpose(0, 2, 1), random).transpose(0, 2, 1)
+        self.noise = noise_like(self.frames.transpose(0, 2, 1), random).transpose(0, 2, 1)
         rows = views(start)
         depth = np.linalg.norm(rows[0, 3:6] - rows[0, :3])
         fan = math.atan((0.5 + REACH) * shape[1] * np.linalg.norm(rows[0, 6:9]) / depth)
