@@ -102,7 +102,7 @@ def test_flat_images_in_another_file_are_asked_for(path, keys):
         entry(file, keys=keys, angles=None)
     data = opened(path, scan)
     assert any("no image has the key of a flat image, 1" in one for one in data.warnings)
-    with pytest.raises(DatasetError, match="images of key 1 in an NXtomo file"):
+    with pytest.raises(DatasetError, match="key 1 of an NXtomo file"):
         data.line_integrals()
     images = np.linspace(0.1, 0.4, VIEWS * 48).reshape(VIEWS, *SHAPE)
     with h5py.File(path, "w") as file:
