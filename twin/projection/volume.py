@@ -751,7 +751,7 @@ class Volume:
         if bias is None:
             summary = None
         else:
-            summary = bias.accuracy(self)
+            summary = bias.accuracy(self, self.sharpness.across)
         return summary
 
     @cached_property

@@ -234,16 +234,17 @@ class Bias:
 
     def _edges(self, width: Width | None, doubling: str) -> tuple[float | None, str]:
         """Compute how wide edges across the axis are at most [mm]: as measured, or as errors
-        double them, whichever is more; and the cause, "" of a measured width.
+        double them, whichever is more; and the cause, "" of a measured width. None where no
+        width was measured.
 
         `width`: measured; `doubling`: the cause that doubles edges most."""
-        found: list[tuple[float, str]] = []
+        if width is None:
+            return None, ""
+        found = [(width.mm + SIGMAS * width.error_mm, "")]
         if self.edges is not None:
             told = max(self.doubled.values(), default=0.0)
             found.append((told + self.edges, doubling or "geometry"))
-        if width is not None:
-            found.append((width.mm + SIGMAS * width.error_mm, ""))
-        return max(found, default=(None, ""))
+        return max(found)
 
 
 def _within(share: float, shift: FloatArray, spread: FloatArray) -> float:
@@ -357,10 +358,10 @@ class BiasOnDemand:
         """Compute the bound of the error at each voxel of a grid; see `Bias.bound`."""
         return self.bias.bound(grid)
 
-    def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
-        """Compute the relative accuracy of uniform regions in a grid; see `Bias.accuracy`.
-        A volume's edges are measured."""
-        width = grid.sharpness.across if isinstance(grid, Volume) else None
+    def accuracy(
+        self, grid: Grid | Volume, width: Width | None = None
+    ) -> Accuracy | None:
+        """Compute the relative accuracy of uniform regions in a grid; see `Bias.accuracy`."""
         return self.bias.accuracy(grid, width)
 
     def warnings(self, grid: Grid | Volume) -> list[str]:

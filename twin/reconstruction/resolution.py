@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.projection.volume import Sharpness, Volume
+from flexdt.twin.projection.volume import Sharpness, Volume, Width
 from flexdt.twin.reconstruction.edge_profiles import edges_of
 from flexdt.twin.reconstruction.feldkamp.half_scans import HalfScans
 
@@ -40,14 +40,8 @@ def sharpness_of(volume: Volume) -> Sharpness:
     Args:
         volume: any; of FDK with its errors, also by half scans.
     """
-    found = edges_of(volume.data)
-    voxel = float(np.cbrt(np.prod(volume.voxel_xyz)))
-    across = along = None
-    if found is not None:
-        edges, every = found
-        up = np.abs(edges.normal[:, 2])
-        across = edges.width(up < ACROSS, every * voxel)
-        along = edges.width(up > ALONG, every * voxel)
+    voxel = _edge_mm(volume)
+    across, along = widths_of(volume)
     noise: Any = getattr(volume, "_noise", None)  # of `volume_errors.with_errors`
     bias: Any = getattr(volume, "_bias", None)
     halves: HalfScans | None = getattr(noise, "half_scans", None)
@@ -60,6 +54,22 @@ def sharpness_of(volume: Volume) -> Sharpness:
         cause = ""
     detail = None if halves is None else detail_mm(halves)
     return Sharpness(across, along, detail, distance, error, voxel, cause)
+
+
+def widths_of(volume: Volume) -> tuple[Width | None, Width | None]:
+    """Measure the widths of a volume's edges across the axis and along it; None without enough."""
+    found = edges_of(volume.data)
+    if found is None:
+        return None, None
+    edges, every = found
+    up = np.abs(edges.normal[:, 2])
+    step = every * _edge_mm(volume)
+    return edges.width(up < ACROSS, step), edges.width(up > ALONG, step)
+
+
+def _edge_mm(volume: Volume) -> float:
+    """Return the side of a cube as large as a voxel [mm]."""
+    return float(np.cbrt(np.prod(volume.voxel_xyz)))
 
 
 def detail_mm(halves: HalfScans) -> float | None:

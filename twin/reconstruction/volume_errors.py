@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.projection.volume import Accuracy, Volume
+from flexdt.twin.projection.volume import Accuracy, Volume, Width
 
 Neighbours = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Float32Array]
 """For each place on an axis its lower node, its upper node, and the upper one's
@@ -40,8 +40,9 @@ class BoundOf(Protocol):
         """
 
     @abstractmethod
-    def accuracy(self, grid: Volume) -> Accuracy | None:
-        """Compute the accuracy of uniform regions in a grid; None if unknown."""
+    def accuracy(self, grid: Volume, width: Width | None) -> Accuracy | None:
+        """Compute the accuracy of uniform regions in a grid, with the measured width of its
+        edges across the axis; None if unknown."""
 
     @abstractmethod
     def doubling(self) -> tuple[str, float]:

@@ -67,6 +67,7 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.plausibility import Operation, examine, settled
 from flexdt.twin.plausibility.volume_grid import voxel_findings
 from flexdt.twin.projection import Volume, gpu
+from flexdt.twin.projection.volume import Width
 from flexdt.twin.reconstruction import (
     Grid,
     LostVoxels,
@@ -95,6 +96,7 @@ from flexdt.twin.reconstruction.known_beam import (
     Beam,
     KnownBeam,
 )
+from flexdt.twin.reconstruction.resolution import widths_of
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 from flexdt.twin.reconstruction.total_variation import WEIGHT
 
@@ -472,7 +474,7 @@ def reconstruct_dataset(
     _require_room(out, task.grid)
     slices = MiddleSlices(task.grid.shape)
     if workers is None:
-        views, bias, doubts = _reconstruct_in_process(
+        views, bias, width, doubts = _reconstruct_in_process(
             task, task.plan(memory), out, slices, tell
         )
     else:
@@ -480,7 +482,7 @@ def reconstruct_dataset(
             views = _apply_corrections(task.views, task.request)
             by_workers = extension("slabs", "a reconstruction by workers")
             doubts = by_workers(views, task.grid, task.request, out, pool, tell)
-        bias = _bias_read_again(views)
+        bias, width = _bias_read_again(views), None
         if task.request.png:
             slices.take(read_volume(out).data)
     accuracy = None
@@ -488,7 +490,7 @@ def reconstruct_dataset(
         if bias is None:
             accuracy = None
         else:
-            accuracy = bias.accuracy(task.grid)
+            accuracy = bias.accuracy(task.grid, width)
         doubts = [*bias_warnings(bias, task.grid), *doubts]
     if task.request.png:
         pictures = slices.write(out)
@@ -580,7 +582,7 @@ def _reconstruct_in_process(
     out: Path,
     slices: MiddleSlices,
     tell: Progress,
-) -> tuple[ScanFrames, BiasOnDemand | None, list[str]]:
+) -> tuple[ScanFrames, BiasOnDemand | None, Width | None, list[str]]:
     """Reconstruct into a file in this process.
 
     The disk must have room for kept images, else LimitError before any work. Doubts are
@@ -594,7 +596,8 @@ def _reconstruct_in_process(
         tell: called with the work done and the total.
 
     Returns:
-        The views, the bias of FDK (None of other algorithms), and doubts.
+        The views, the bias of FDK and the width of edges across the axis in its middle slab
+        (None of other algorithms), and doubts.
     """
     folder = out.absolute().parent
     grid = task.grid
@@ -608,16 +611,18 @@ def _reconstruct_in_process(
             volume = _iterative(views, grid, task.request, tell)
             write(volume.data)
             slices.take(volume.data)
-            return views, None, []
+            return views, None, None, []
         views = _copied(views)
         lost = LostVoxels()
+        width = None
         for slab in _fdk_slabs(task, views, kept_images, plan, work):
             write(slab.data)
-            slices.take(slab.data)
+            if slices.take(slab.data):
+                width, _ = widths_of(slab)
             lost += LostVoxels.of(slab.data)
             del slab  # before there is another
         bias = _bias(views)
-    return views, bias, lost.warnings()
+    return views, bias, width, lost.warnings()
 
 
 def _fdk_slabs(

@@ -201,17 +201,19 @@ class MiddleSlices:
         self._across_x = np.zeros((nz, ny), np.float32)
         self._done = 0
 
-    def take(self, slab: npt.NDArray[np.float32]) -> None:
+    def take(self, slab: npt.NDArray[np.float32]) -> bool:
         """Take the next layers (k, ny, nx), from the lowest up, and keep the parts of the
-        three middle slices.
+        three middle slices; whether the middle layer is among them.
         """
         nz, ny, nx = self._shape
         layers = slice(self._done, self._done + len(slab))
         self._across_y[layers] = slab[:, ny // 2]
         self._across_x[layers] = slab[:, :, nx // 2]
-        if layers.start <= nz // 2 < layers.stop:
+        middle = layers.start <= nz // 2 < layers.stop
+        if middle:
             self._across_z[:] = slab[nz // 2 - layers.start]
         self._done = layers.stop
+        return middle
 
     @property
     def images(self) -> dict[str, npt.NDArray[np.float32]]:
