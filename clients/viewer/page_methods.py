@@ -17,7 +17,7 @@ import secrets
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -40,6 +40,7 @@ from flexdt.clients.viewer.scenes.world import motors
 from flexdt.clients.viewer.shown_images import ShownImage, grey, packed, window_of
 from flexdt.clients.viewer.viewer import PageMethod, Viewer
 from flexdt.clients.viewer.volumes.reconstruction_process import wish
+from flexdt.phantoms import is_shipped, load_phantom
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
 from flexdt.protocol.field_checks import few
@@ -790,16 +791,23 @@ def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, flo
 
 async def datasets(viewer: Viewer, page: Page, params: Datasets) -> object:
     """List data sets, newest first, from `start` on and matching `search`, with
-    thumbnails in base64; the twin's answer.
+    thumbnails in base64, and whether the sample has beads; the twin's answer.
 
-    A thumbnail is at most 96 pixels a side; None stays None.
+    A thumbnail is at most 96 pixels a side; None stays None. `beads` is None of samples that do
+    not ship.
     """
     asked = {"search": params.search, "start": params.start, "thumbnail": 96}
     told: Any = await page.link.request("dataset.list", asked)
     for info in told["datasets"]:
         if (small := info["thumbnail"]) is not None:
             small["data"] = base64.b64encode(small["data"]).decode("ascii")
+        info["beads"] = await asyncio.to_thread(_has_beads, info["sample"] or "")
     return told
+
+
+@lru_cache(maxsize=256)
+def _has_beads(sample: str) -> bool | None:
+    return len(load_phantom(sample).beads) > 0 if is_shipped(sample) else None
 
 
 async def estimate(

@@ -231,9 +231,13 @@ def of_scan(said: dict[str, Any], wire: Wire) -> list[str]:
     if not texts["job-state"].startswith(job.state):
         found.append(f"scan: {texts['job-state']}, not {job.state}")
     if job.state == "aborted" and job.ended_by:
-        who = "you" if job.ended_by == said["session"] else job.ended_by
-        if who not in texts["job-state"]:
-            found.append(f"scan: {texts['job-state']}, by {who}")
+        name = job.ended_by.rpartition(" #")[0]
+        own = (said["session"] or "").rpartition(" #")[0]
+        whose = ["you"] if job.ended_by == said["session"] else [name]
+        if name == own:  # of this tab before a reload, or of another person of that name
+            whose.append("you")
+        if not any(texts["job-state"] == f"aborted by {who}" for who in whose):
+            found.append(f"scan: {texts['job-state']}, by {job.ended_by}")
     if job.state in ("aborted", "failed", "incomplete"):
         off = "X-rays are off" in texts["job-what"]
         if off == wire.state.tube.on:

@@ -278,9 +278,20 @@ def test_the_volume_of_a_past_scan_is_that_of_the_command(
     told: list[dict[str, Any]] = []
     made = held(told.append, past=True)
     reconstruct(made, home, 120)
-    assert told[0]["phase"] == "opening the scan"
-    done = [d["done"] for d in told[1:]]
+    done = [d["done"] for d in told]
     assert done == sorted(done)
+    stages = [d.get("phase") for d in told]
+    begun = dict(zip(stages[::-1], done[::-1], strict=True))  # where each of them begins
+    assert list(begun)[::-1] == [
+        "looking at the pixels",
+        "reading and reconstructing",
+        "comparing the images",
+        "finding the accuracy",
+        "finding the noise",
+        None,
+    ]
+    assert np.diff([*begun.values()]).max() < 0
+    assert begun["looking at the pixels"] == 0
     last = told[-1]
     assert (last["done"], last["views"], last["of"]) == (1.0, VIEWS, VIEWS)
     out = tmp_path / "volume.tif"

@@ -134,7 +134,8 @@ def test_a_reset_is_armed_after_a_second_asks_and_names_who_stopped(
     b.click("#estop")
     a.click("#reset")
     dialog = a.locator("#reset-dialog")
-    assert f"Emergency stop by {who}" in dialog.inner_text()
+    named = who.rpartition(" #")[0]  # the number of a session is no person
+    assert f"Emergency stop by {named}: " in dialog.inner_text()
     assert "X-rays are off and stay off" in dialog.inner_text()
     first = twin.state().safety
     assert (first.estop, first.stopped_by) == (True, who)

@@ -132,10 +132,12 @@ def check_plan(
 
 
 def _moved(plan: ScanPlan, positions: Mapping[str, float]) -> str:
-    """List positions of the motors that are not where they start [mm, deg]."""
-    start = plan.start.positions
+    """List positions of the motors that are not where they start, with units."""
+    axes, start = plan.machine.axes, plan.start.positions
     moved = {k: x for k, x in positions.items() if abs(x - start.get(k, x)) > 5e-4}
-    return ", ".join(f"{name} {x:.3f}" for name, x in (moved or positions).items())
+    return ", ".join(
+        f"{name} {x:.3f} {axes[name].unit}" for name, x in (moved or positions).items()
+    )
 
 
 def _start_problems(plan: ScanPlan) -> list[Finding]:

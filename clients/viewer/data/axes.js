@@ -1,6 +1,18 @@
 // The Move tab: a slider, a number and two hold-to-jog buttons for every axis, and the keys.
 import { partWords } from "./figures.js";
-import { $, $input, $select, el, field, fixed, keep, parsed, setText, term } from "./dom.js";
+import {
+  $,
+  $input,
+  $select,
+  el,
+  field,
+  fixed,
+  isNumber,
+  keep,
+  parsed,
+  setText,
+  term,
+} from "./dom.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 import { reached } from "./reached.js";
 /** @import { AxisState, State } from "../web/viewer.d.ts" */
@@ -15,7 +27,11 @@ const GROUPS = [
   [
     "Sample",
     "#3aa0ff",
-    { mag_obj: "along the beam", tra_obj: "sideways", ver_obj: "to the beam" },
+    {
+      mag_obj: "along the beam",
+      tra_obj: "sideways",
+      ver_obj: "height, by source and detector",
+    },
   ],
   [
     "Detector",
@@ -196,7 +212,7 @@ function title(axis, error) {
 /**
  * Whether the axes were sent there; the first one names them.
  * @param {Record<string, number>} targets
- * @param {(axis: string, error: unknown) => string} [told] what came of a refusal
+ * @param {(axis: string, error: unknown) => string | [string, string]} [told] of a refusal
  */
 async function send(targets, told = title) {
   const [axis] = Object.keys(targets);
@@ -229,14 +245,14 @@ function mainRow(main, state) {
     const s = store.state;
     input.blur();
     if (!s || !(value > 0 || (axes.length > 1 && Number.isFinite(value)))) {
-      emit("note", "error", `${words} stays`, `“${text}” is not a number above 0`);
+      emit("note", "error", `${words} stays`, `“${text}” is not a number above 0`, axes[0]);
       return;
     }
     const by = shift(s, value);
     /** @type {Record<string, number>} */
     const targets = {};
     for (const name of axes) targets[name] = s.axes[name].position + by;
-    void send(targets, (axis, error) => refused(main, s, axis, error));
+    void send(targets, (axis, error) => refused(main, s, text, axis, error));
   }
   input.addEventListener("blur", () => {
     if (store.state) drawMains(store.state);
@@ -256,18 +272,38 @@ function mainRow(main, state) {
  * What came of a value that was refused, in its own unit: the motors are named in the sentence.
  * @param {Main} main
  * @param {State} s when it was typed
+ * @param {string} text that was typed
  * @param {string} axis
  * @param {unknown} error
+ * @returns {string | [title: string, words: string]}
  */
-function refused({ words, unit, digits, now, shift }, s, axis, error) {
+function refused({ words, unit, digits, now, shift }, s, text, axis, error) {
   const halts = haltsAt(error);
-  const at =
-    axis in halts
-      ? reached(now(s), halts[axis] - s.axes[axis].position, (v) => shift(s, v))
-      : NaN;
-  return Number.isFinite(at)
-    ? `${words} halts at ${fixed(at, digits)} ${unit}`
-    : `${words} does not get there`;
+  /** @param {number} place of the motor */
+  const of = (place) => reached(now(s), place - s.axes[axis].position, (v) => shift(s, v));
+  const at = axis in halts ? of(halts[axis]) : NaN;
+  if (Number.isFinite(at)) return `${words} halts at ${fixed(at, digits)} ${unit}`;
+  const ends = travel(error, axis).map(of);
+  if (!ends.length || !ends.every(Number.isFinite)) return `${words} does not get there`;
+  const [low, high] = ends.sort((a, b) => a - b);
+  const tenth = 10 ** digits; // an end that was rounded outwards would be refused
+  const range = [Math.ceil(low * tenth) / tenth, Math.floor(high * tenth) / tenth];
+  const [from, to] = range.map((end) => fixed(end, digits));
+  return [`${words} stays`, `${text} ${unit} is outside ${from} to ${to} ${unit}`];
+}
+
+/**
+ * The ends of a motor's travel that a target was beyond; none of another refusal.
+ * @param {unknown} error
+ * @param {string} axis
+ * @returns {number[]}
+ */
+function travel(error, axis) {
+  const data = /** @type {{ axis?: string; allowed?: unknown } | null} */ (
+    error instanceof Failure ? error.data : null
+  );
+  const allowed = data?.axis === axis ? data.allowed : null;
+  return Array.isArray(allowed) && allowed.every(isNumber) ? allowed : [];
 }
 
 /** @param {State} state */
@@ -393,7 +429,7 @@ function axisRow(name, axis, what) {
     const value = parsed(text);
     number.blur();
     if (Number.isFinite(value)) void move(name, value);
-    else emit("note", "error", `${name} does not move`, `“${text}” is not a number`);
+    else emit("note", "error", `${name} does not move`, `“${text}” is not a number`, name);
   }
   number.addEventListener("blur", () => {
     box.classList.remove("chosen");

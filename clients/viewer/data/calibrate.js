@@ -194,10 +194,13 @@ async function datasets() {
   const none = !answer.datasets.some((each) => each.present);
   $button("#fit").disabled = none;
   if (none) box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
+  withoutBeads.clear();
+  for (const { name, beads } of answer.datasets) if (beads === false) withoutBeads.add(name);
   for (const d of answer.datasets.filter((each) => each.present)) {
     const own = () => {
       if (tick.checked && d.sample) $input("#fit-phantom").value = d.sample;
       named();
+      weigh();
     };
     const told = { type: "checkbox", value: d.name, checked: chosen.has(d.name) };
     const tick = el("input", { ...told, onchange: own });
@@ -211,6 +214,16 @@ async function datasets() {
     );
   }
 }
+/** Whether calibrating is the thing to do: not where the ticked samples are known without beads. */
+function weigh() {
+  const beadless = ticked().filter((name) => withoutBeads.has(name));
+  $("#fit").classList.toggle("primary", !beadless.length);
+  const words = "has no beads to calibrate by: Align, in the Data tab, finds its axis without";
+  if ($button("#fit").disabled) return;
+  $("#fit-note").textContent = beadless.length ? `${beadless.join(", ")} ${words}` : "";
+}
+/** @type {Set<string>} */
+const withoutBeads = new Set();
 function named() {
   $("#fit-scale").hidden = $("#fit-scale-label").hidden =
     $input("#fit-phantom").value !== "unknown";
@@ -246,7 +259,7 @@ async function estimate(method, params, names, title) {
   /** @type {Partial<FitReport & CalibrationAlignResult> | null} */
   const r = await command(method, params, title);
   $button("#fit").disabled = false;
-  $("#fit-note").textContent = "";
+  weigh();
   if (!r) return;
   const scan = know(r.tracks?.datasets ?? []);
   const { correction, parameters = {} } = r;

@@ -55,13 +55,13 @@ export const problem = (job) =>
 
 /**
  * @param {JobStatus} job
- * @param {(name: string) => boolean} isMe
+ * @param {(name: string) => string} doer
  * @returns {string}
  */
-export function stateWords(job, isMe) {
+export function stateWords(job, doer) {
   const by = job.ended_by;
   if (neverBegan(job)) return "taken off the queue";
-  if (job.state === "aborted" && by) return `aborted by ${isMe(by) ? "you" : by}`;
+  if (job.state === "aborted" && by) return `aborted by ${doer(by)}`;
   if (isOver(job)) return job.state;
   const pace =
     job.speed_up === "max" ? " · max" : job.speed_up === 1 ? "" : ` · ${job.speed_up}×`;

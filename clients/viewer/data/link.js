@@ -180,21 +180,47 @@ export function call(method, params = {}) {
 }
 
 /**
- * A command of a person: what goes wrong becomes a note, whose title may depend on the error.
+ * What a request is about: a motor, else the request itself. One that ends a motion says nothing of
+ * what was asked before.
+ * @param {string} method
+ * @param {{ targets?: Record<string, number>; axis?: string; velocity?: number }} params
+ * @returns {string}
+ */
+function subject(method, { targets, axis, velocity }) {
+  const motor = targets ? Object.keys(targets)[0] : axis;
+  return motor === undefined || velocity === 0 ? method : motor;
+}
+
+/**
+ * A command of a person: what goes wrong becomes a note, whose title, or title and words, may
+ * depend on the error. It goes once the same is done.
  * @template {Method} M
  * @param {M} method
  * @param {Partial<Requests[M]>} [params]
- * @param {string | ((error: unknown) => string)} [title]
+ * @param {string | ((error: unknown) => string | [title: string, words: string])} [title]
  * @returns {Promise<Answers[M] | null>}
  */
 export async function command(method, params = {}, title = "Refused") {
+  const about = subject(method, params);
   try {
-    return await call(method, params);
+    const answer = await call(method, params);
+    emit("settled", about);
+    return answer;
   } catch (error) {
-    emit("note", "error", typeof title === "function" ? title(error) : title, words(error));
+    const told = typeof title === "function" ? title(error) : title;
+    const [head, body] = typeof told === "string" ? [told, words(error)] : told;
+    emit("note", "error", head, body, isOfControl(error) ? "control" : about);
     return null;
   }
 }
+
+/**
+ * Whether a request was refused because another controls.
+ * @param {unknown} error
+ */
+const isOfControl = (error) =>
+  error instanceof Failure &&
+  Boolean(/** @type {{ controller?: string } | null} */ (error.data)?.controller);
 
 /** How many jobs or samples are asked for at once. */
 const PART = 200;
@@ -250,6 +276,28 @@ export const isMe = (name) =>
   (names.has(name) || (!!numberOf(name) && numberOf(name) === numberOf(store.session)));
 /** @type {Set<string>} */
 const names = new Set();
+
+// A session ends with a reload, what was done in it stays this tab's.
+const FORMER = "flexdt-sessions";
+const FORMER_KEPT = 50;
+/** @returns {string[]} */
+const former = () =>
+  /** @type {string[]} */ (JSON.parse(sessionStorage.getItem(FORMER) ?? "[]"));
+
+/**
+ * Who did something: "you" for this tab, reloads and twins before this one included, else the
+ * name; the number of a session that may be over tells nobody apart.
+ * @param {string} name
+ * @returns {string}
+ */
+export const doer = (name) => (former().includes(name) ? "you" : name.replace(/ #\d+$/, ""));
+
+/** @param {string} name */
+function remember(name) {
+  if (!person()) return; // a new twin counts from 1: without a name it may be another's
+  const all = [name, ...former().filter((one) => one !== name)].slice(0, FORMER_KEPT);
+  sessionStorage.setItem(FORMER, JSON.stringify(all));
+}
 export function connect() {
   // Below the page's own address: a proxy may have put it anywhere.
   const address = new URL(`ws/${pageId}`, document.baseURI);
@@ -351,7 +399,10 @@ const handlers = {
   session(m) {
     store.session = m.session;
     if (m.session === null) names.clear();
-    else names.add(m.session);
+    else {
+      names.add(m.session);
+      remember(m.session);
+    }
     emit("connection");
     if (!m.connected) return;
     sendUrgent();

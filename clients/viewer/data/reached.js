@@ -16,7 +16,11 @@ export function reached(now, by, shift) {
     const off = shift(value) - by;
     if (Math.abs(off) < CLOSE) return value;
     const step = 1e-6 * Math.max(1, Math.abs(value));
-    value -= (off * step) / (shift(value + step) - shift(value));
+    let to = (off * step) / (shift(value + step) - shift(value));
+    // A step of Newton's may pass the pole of a quotient: it gets nearer, or is halved.
+    for (let n = 0; n < ROUNDS && Math.abs(shift(value - to) - by) > Math.abs(off); n++)
+      to /= 2;
+    value -= to;
   }
   return Math.abs(shift(value) - by) < 1e-3 ? value : NaN;
 }

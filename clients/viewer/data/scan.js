@@ -396,6 +396,23 @@ function clearance({ min_clearance_mm: mm, min_clearance_pair: pair }) {
 }
 
 /**
+ * Problems, with the collisions of one line's motion together: the first ends it.
+ * @param {Problem[]} all
+ * @returns {Problem[][]}
+ */
+function events(all) {
+  /** @type {Problem[][]} */
+  const found = [];
+  for (const p of all) {
+    const last = found.at(-1)?.[0];
+    const same = last?.code === "collision" && p.code === "collision" && last.line === p.line;
+    if (same) found.at(-1)?.push(p);
+    else found.push([p]);
+  }
+  return found;
+}
+
+/**
  * @param {Report} r
  * @param {Fingerprint | null} [made]
  */
@@ -409,7 +426,9 @@ export function show(r, made = now()) {
   box.textContent = "";
   const warnings = problems.filter(({ severity }) => severity !== "error").length;
   const warned = warnings ? `, ${warnings} warning${warnings === 1 ? "" : "s"}` : "";
-  const facts = [seconds(r.duration_s), `${r.frames} frames`, bytes(r.bytes), clearance(r)];
+  const facts = r.frames
+    ? [seconds(r.duration_s), `${r.frames} frames`, bytes(r.bytes), clearance(r)]
+    : [r.duration_s ? seconds(r.duration_s) : "", clearance(r)];
   box.append(
     el(
       "div",
@@ -438,15 +457,19 @@ export function show(r, made = now()) {
           `line ${line}`,
         )
       : el("span", { class: "muted" }, "whole");
-  for (const p of problems.slice(0, 100)) {
-    box.append(
-      el(
-        "div",
-        { class: "problem" },
-        link(p.line),
-        el("span", { class: p.severity === "error" ? "error" : "caution" }, p.message),
-      ),
+  /** @param {typeof problems[number]} p */
+  const row = (p) =>
+    el(
+      "div",
+      { class: "problem" },
+      link(p.line),
+      el("span", { class: p.severity === "error" ? "error" : "caution" }, p.message),
     );
+  for (const [first, ...rest] of events(problems.slice(0, 100))) {
+    box.append(row(first));
+    if (!rest.length) continue;
+    const more = `${rest.length} more pair${rest.length > 1 ? "s" : ""} of the same motion`;
+    box.append(el("details", {}, el("summary", {}, more), ...rest.map(row)));
   }
   if (r.steps.length)
     box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map(stepRow)));

@@ -1,7 +1,7 @@
 // The scan in the bar: how far it is, what it waits for or who ended it, and what can be done
 // now.
 import { $, $button, clicks, setText } from "./dom.js";
-import { command, emit, isMe, on, store } from "./link.js";
+import { command, doer, emit, on, store } from "./link.js";
 import {
   isOver,
   isUnfinished,
@@ -50,7 +50,7 @@ function draw() {
   bar.hidden = job === null || job.job === dismissed;
   if (!job) return;
   setText($("#job-name"), job.name || job.job);
-  setText($("#job-state"), stateWords(job, isMe));
+  setText($("#job-state"), stateWords(job, doer));
   setText($("#job-frames"), `${job.frames_done} / ${job.frames_total} frames`);
   setText($("#job-left"), timeLeft(job, left(job, performance.now() / 1000)));
   const what = whatWords(job, store.twin ? store.state : null);

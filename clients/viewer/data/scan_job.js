@@ -1,6 +1,6 @@
 // The scan that runs, waits or has ended last: followed by the twin's events, by its states, and
 // by asking where an end was not heard of.
-import { allJobs, call, command, emit, Failure, isMe, on, store } from "./link.js";
+import { allJobs, call, command, doer, emit, Failure, on, store } from "./link.js";
 import { isOver, isUnfinished, neverBegan, problem, submittedWords } from "./job_words.js";
 /** @import { JobStatus } from "../web/viewer.d.ts" */
 
@@ -50,9 +50,8 @@ on("job", (job) => {
   if (news && job.error && !isMeant(job)) {
     emit("note", "error", `Scan ${job.state}`, problem(job));
   }
-  if (news && job.state === "aborted" && job.ended_by && !isMe(job.ended_by)) {
-    emit("note", "warning-note", "Scan aborted", `by ${job.ended_by}`);
-  }
+  const by = job.state === "aborted" && job.ended_by ? doer(job.ended_by) : "you";
+  if (news && by !== "you") emit("note", "warning-note", "Scan aborted", `by ${by}`);
 });
 on("state", (state) => {
   if (state.job) show(state.job);

@@ -12,6 +12,7 @@ const NAMES = "xyz";
 const TOP = 65534;
 const UNKNOWN = 0xff6e5a50;
 const BAR = "#ffd54a";
+const BEHIND = "#05070ab0";
 const CROSS = "#5ab0ffb0";
 const LINE = "#36e28f";
 const BINS = 160;
@@ -69,7 +70,11 @@ export function drawBar(x, mm, px, unit) {
   x.font = `${11 * unit}px system-ui, sans-serif`;
   x.textBaseline = "bottom";
   x.textAlign = "left";
-  outlined(x, `${mm} mm`, 8 * unit, h - 2 * unit, unit);
+  const words = `${mm} mm`;
+  x.fillStyle = BEHIND; // lines of a volume's box pass there
+  x.fillRect(6 * unit, h - 15 * unit, x.measureText(words).width + 4 * unit, 14 * unit);
+  x.fillStyle = BAR;
+  outlined(x, words, 8 * unit, h - 2 * unit, unit);
 }
 
 /**

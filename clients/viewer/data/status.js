@@ -10,18 +10,28 @@ import "./readouts.js";
 /** @import { ClockState, State } from "../web/viewer.d.ts" */
 
 /**
+ * Removes the notes about a subject.
+ * @param {string} about
+ */
+function settle(about) {
+  for (const n of $$("#notes > *")) if (n.dataset.about === about) n.remove();
+}
+on("settled", settle);
+
+/**
+ * A note replaces the last one about its subject (a motor, a request, control): of what has none
+ * the words are the subject.
  * @param {string} kind
  * @param {string} title
  */
-export function note(kind, title, body = "", life = kind === "error" ? 12000 : 6000) {
+export function note(kind, title, body = "", about = title + body) {
+  const life = kind === "error" ? 12000 : 6000;
   const box = $("#notes");
-  $$("#notes > *")
-    .find((n) => n.dataset.key === title + body)
-    ?.remove();
+  settle(about);
   /** @type {HTMLElement} */
   const node = el(
     "div",
-    { class: `note ${kind}`, "data-key": title + body },
+    { class: `note ${kind}`, "data-about": about },
     el("b", {}, title),
     el("span", {}, body),
     el("button", { "aria-label": "close", onclick: () => node.remove() }, "×"),
@@ -30,15 +40,12 @@ export function note(kind, title, body = "", life = kind === "error" ? 12000 : 6
   while (box.childElementCount > 5) box.firstChild?.remove();
   setTimeout(() => node.remove(), life);
 }
-on("note", (kind, title, body) => note(kind, title, body));
-/** What the bar of a stop says is not said twice. */
-const ofStop = /^E-stop by /;
-/** What is said of another's control holds no longer than that. */
-const OTHERS = / took control from you$| is the controller; /;
-on("log", (entry) => {
-  if (!["warning", "error"].includes(entry.level) || ofStop.test(entry.message)) return;
-  const kind = entry.level === "error" ? "error" : "warning-note";
-  note(kind, "Twin", toYou(entry.message, store.session));
+on("note", note);
+on("log", ({ level, message, data }) => {
+  // What the bar of a stop says is not said twice.
+  if (!["warning", "error"].includes(level) || data?.about === "estop") return;
+  const kind = level === "error" ? "error" : "warning-note";
+  note(kind, "Twin", toYou(message, store.session), data?.about);
 });
 
 /**
@@ -55,7 +62,7 @@ on("state", (s) => {
   release(s);
   if (s.safety.estop && s.safety.stop !== pressed?.after) {
     pressed = null;
-    for (const n of $$("#notes .note")) if (n.dataset.key?.startsWith(UNCONFIRMED)) n.remove();
+    settle("safety.estop");
   }
   holder();
 });
@@ -64,8 +71,7 @@ function holder() {
   const pill = $("#holder");
   const who = store.state?.controller ?? null;
   const mine = isMe(who);
-  if (mine || who === null)
-    for (const n of $$("#notes .note")) if (OTHERS.test(n.dataset.key ?? "")) n.remove();
+  if (mine || who === null) settle("control"); // what is said of another's holds no longer
   // Without the twin nobody knows who may; with it the next state says.
   pill.dataset.state = !store.twin ? "none" : mine ? "mine" : who ? "other" : "none";
   setText(

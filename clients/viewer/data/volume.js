@@ -36,6 +36,7 @@ const BEGINS = "the reconstruction begins";
 const COMPARES = "Beside what the sample is made of, with a correction and without";
 const GROWS =
   "accuracy and truth come after the scan: open its data set in Data and press Reconstruct";
+const WAITED_S = 2;
 const EXACT_MS = 60;
 // Largest first zoom of a volume in three dimensions, and the room about its object.
 const NEAREST = 4;
@@ -135,18 +136,31 @@ const unit = () =>
   told && !told.past && (told.views ?? 0) < (told.of ?? 0)
     ? `per mm, × ${told.views} / ${told.of}`
     : "per mm";
-// What has no share yet moves at least with the clock.
+// Within a stage of the work whose share does not move, its seconds do.
 /** @type {number | undefined} */
 let waits;
-/** @param {string} what */
-function wait(what) {
+let stage = "";
+let since = 0;
+
+/**
+ * Says in the note what there is, and below it what the work is at, for how long.
+ * @param {string} what "" where nothing is waited for
+ * @param {string} before
+ */
+function wait(what, before = "") {
   clearInterval(waits);
   if (!what) return;
-  const since = performance.now();
-  waits = window.setInterval(
-    () => setText(note, `${what} … ${fixed((performance.now() - since) / 1000, 0)} s`),
-    1000,
-  );
+  const now = performance.now();
+  const [name] = what.split(":");
+  if (name !== stage) since = now;
+  stage = name;
+  const tell = () => {
+    const for_s = (performance.now() - since) / 1000;
+    const waited = for_s < WAITED_S ? "" : ` … ${fixed(for_s, 0)} s`;
+    setText(note, `${before}${what}${waited}`);
+  };
+  tell();
+  waits = window.setInterval(tell, 1000);
 }
 function forget() {
   blocks.clear();
@@ -234,10 +248,10 @@ on("volume", (m) => {
   const working = m.comparing !== undefined && m.comparing < 1 && !m.not_compared;
   progress.hidden = m.past ? m.done === 1 && !working : true;
   progress.value = working ? (m.comparing ?? 0) : (m.done ?? 0);
+  const share = `${fixed(100 * progress.value, 0)} %`;
+  const at = m.past && !progress.hidden ? `${m.phase ?? BEGINS}: ${share}` : "";
   if (!m.size) {
-    if (m.done === undefined) wait(m.phase ?? BEGINS);
-    else if (m.done === 1) setText(note, `${other}reconstructed: its slices follow`);
-    else setText(note, `${other}reading and reconstructing: ${fixed(100 * m.done, 0)} %`);
+    wait(at, other);
     return;
   }
   if (m.past) setText($button("#volume-cancel"), "Close");
@@ -250,12 +264,13 @@ on("volume", (m) => {
       ? `${fixed(100 * m.uncovered, 1)} % without data (grey)`
       : "",
     m.binning ? `flexdt reconstruct --binning ${m.binning}` : "",
-    working ? `comparing: ${fixed(100 * (m.comparing ?? 0), 0)} %` : "",
     m.not_compared,
     ...(m.doubts ?? []),
     m.past ? "" : GROWS,
   ];
-  setText(note, other + facts.filter(Boolean).join(" · "));
+  const said = other + facts.filter(Boolean).join(" · ");
+  setText(note, said);
+  wait(at, `${said} · `);
   note.title = m.details ?? "";
   if (m.volumes) offer(m.volumes, Object.keys(m.compared ?? {})[1]);
   if (more && pointer) point(pointer);

@@ -27,8 +27,8 @@ function words() {
     return "not on the stage: its data set does not say where the sample stood";
   const of = ofVolume(made);
   const differ = differences(of, store.now ?? {});
-  if (!differ.length)
-    return samplesApart() ? "not drawn beside images of another sample" : "stands on the stage";
+  if (samplesApart()) return "not on the stage: the open scan’s sample is not there";
+  if (!differ.length) return "stands on the stage";
   const what = listed(differ).replace("sample", `sample (${sampleOf(of)})`);
   return `not on the stage: of another ${what}`;
 }

@@ -2,7 +2,7 @@
 // row of its own above it.
 import { $, el, fixed } from "./dom.js";
 import { partWords } from "./figures.js";
-import { isMe, on, store } from "./link.js";
+import { doer, isMe, on, store } from "./link.js";
 import { OLD_S } from "./moment.js";
 import { outline, OUTSIDE } from "./sample_outline.js";
 /** @import { State } from "../web/viewer.d.ts" */
@@ -36,7 +36,7 @@ export function hindered(s) {
  */
 export function stopped({ safety: { estop, stopped_by: by, message } }) {
   if (!estop) return `Blocked: ${message || "reset to go on"}`;
-  const who = by ? ` by ${isMe(by) ? "you" : by}` : "";
+  const who = by ? ` by ${doer(by)}` : "";
   return `Emergency stop${who}: nothing moves until it is reset`;
 }
 
@@ -107,6 +107,15 @@ function ofImage(s) {
   return list;
 }
 
+/**
+ * The scene has the same image as the radiograph, whose tag says how old it is.
+ * @returns {Warning[]}
+ */
+const ofPanel = () =>
+  store.imageAge > OLD_S && store.image && store.layers.panel
+    ? [["", "The image on the panel is old, as the radiograph’s tag says"]]
+    : [];
+
 /** @param {number} part */
 const share = (part) => (part < 0.01 ? "some" : `${fixed(100 * part, 0)} %`);
 
@@ -130,7 +139,7 @@ function draw(s) {
   const away = s.job?.state === "running"; // the script has put it there
   const seen = outside.filter((words) => !away || words !== OUTSIDE);
   const cut = seen.map((words) => /** @type {Warning} */ (["", words]));
-  const list = [...ofMachine(s), ...cut, ...ofImage(s), ...ofScan(s)];
+  const list = [...ofMachine(s), ...cut, ...ofImage(s), ...ofPanel(), ...ofScan(s)];
   const key = JSON.stringify(list);
   if (key === last) return;
   last = key;

@@ -24,13 +24,15 @@ requests by `exact`, because codes are rounded.
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import os
 import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -75,6 +77,23 @@ TELL_S: Final = 0.4
 """Least interval between two lines [s]."""
 SURFACE_INTERVAL_S: Final = 1.2
 """Least interval between two surfaces for the scenes [s]."""
+
+RECONSTRUCTING: Final = {
+    "looking at the pixels": 0.18,
+    "reading and reconstructing": 0.27,
+    "comparing the images": 0.35,
+    "finding the accuracy": 0.13,
+    "finding the noise": 0.07,
+}
+"""Stages of a past scan's volume, and their shares of its processor time (11 s; 153 images at
+256 columns, of the gear)."""
+COMPARING: Final = {
+    "computing the truth": 0.45,
+    "measuring the volume": 0.15,
+    "reconstructing with the other geometry": 0.25,
+    "measuring the other volume": 0.15,
+}
+"""Those of its comparison with the truth (12 s; same scan)."""
 
 Tell = Callable[[dict[str, Any]], None]
 
@@ -247,12 +266,10 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
     """Reconstruct the volume of a past scan, as `flexdt reconstruct` does from binned
     images.
 
-    At the end it gets accuracy or doubts, the part of voxels that no view sees, the
-    surface, and then the volumes of errors, if any. Warnings of the reconstruction become
-    `doubts`, followed by the accuracy, whose `details` a tooltip shows, and the sharpness if
-    there are edges. The surface is printed with
-    `FINISHED_CELLS` cells and not stored. `sigma` and `bias_bound` are stored if they
-    were computed.
+    The volume and its surface come first, with the reconstruction's warnings as `doubts` and
+    the part of voxels that no view sees; then the accuracy, whose `details` a tooltip shows,
+    the sharpness if there are edges, and `sigma` and `bias_bound`, if any. The surface is
+    printed with `FINISHED_CELLS` cells and not stored.
 
     Args:
         held: gets the volume and the progress.
@@ -262,7 +279,8 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
     Raises:
         TwinError: as `reconstruct_volume`.
     """
-    held.say(phase="opening the scan")
+    work = Stages(held, "done", RECONSTRUCTING)
+    work.begin("looking at the pixels")
     data = load_dataset(folder)
     held.dataset = data
     held.about |= {"made": made_of(data), "saturated": _saturated(data)}
@@ -270,50 +288,85 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always")
         volume = reconstruct_volume(
-            data, held.request, progress=_share(held, "done"), errors=True
+            data,
+            held.request,
+            progress=work.reading("reading and reconstructing"),
+            errors=True,
         )
     said = [str(doubt.message) for doubt in doubts]
+    held.hold(volume.data, volume)  # what shows need not wait for its errors
+    held.about |= {
+        "views": len(data.present),
+        "of": len(data),
+        "binning": held.request.binning,
+        "geometry": _named(data.correction),
+        "doubts": said,
+        "uncovered": float(1.0 - np.isfinite(volume.data).mean()),
+        **_facts(data),
+    }
+    work.begin("comparing the images")
+    grown = volume.data.transpose(1, 2, 0)
+    held.say(surface=surface(grown, volume.voxel_mm, volume.center_mm, FINISHED_CELLS))
+    sharpness = volume.sharpness
+    work.begin("finding the accuracy")
     accuracy = volume.accuracy
     if accuracy is not None and not any(str(accuracy) in doubt for doubt in said):
         said.append(str(accuracy))
-    if volume.sharpness.across is not None:
-        said.append(str(volume.sharpness))
-    held.hold(volume.data, volume)
-    held.keep(
-        done=1.0,
-        views=len(data.present),
-        of=len(data),
-        binning=held.request.binning,
-        geometry=_named(data.correction),
-        doubts=said,
-        details="" if accuracy is None else accuracy.details,
-        uncovered=float(1.0 - np.isfinite(volume.data).mean()),
-        **_facts(data),
-    )
-    grown = volume.data.transpose(1, 2, 0)
-    held.say(surface=surface(grown, volume.voxel_mm, volume.center_mm, FINISHED_CELLS))
-    for name in ("sigma", "bias_bound"):  # the volume need not wait for its errors
+    if sharpness.across is not None:
+        said.append(str(sharpness))
+    held.about["details"] = "" if accuracy is None else accuracy.details
+    work.begin("finding the noise")
+    for name in ("sigma", "bias_bound"):
         if (found := getattr(volume, name)) is not None:
             held.volumes[name] = found
-    held.keep(volumes=list(held.volumes))
+    held.about["volumes"] = list(held.volumes)
+    work.end()
 
 
-def _share(held: Held, name: str) -> Callable[[float, float], None]:
-    """Make a progress callback (done, whole) that reports the share under a name.
+class Stages:
+    """Report how far work of several stages is, by their shares of it.
 
-    At most every `TELL_S` seconds.
+    Args:
+        held: says so, and keeps it with the facts.
+        name: of the share that is done, 0 to 1, among the facts.
+        shares: stage -> its part of the whole, in order.
     """
-    told = -TELL_S
 
-    def report(done: float, whole: float) -> None:
-        nonlocal told
-        now = time.monotonic()
-        if now < told + TELL_S:
-            return
-        told = now
-        held.say(**{name: done / whole})
+    def __init__(self, held: Held, name: str, shares: Mapping[str, float]) -> None:
+        """Take the stages; nothing is said before the first one begins."""
+        self._held = held
+        self._name = name
+        self._shares = shares
+        self._told = 0.0
 
-    return report
+    def begin(self, stage: str) -> None:
+        """Say that a stage begins: those before it are done."""
+        self._say(stage, 0.0)
+
+    def reading(self, stage: str) -> Callable[[float, float], None]:
+        """Make a progress callback (done, whole) of a stage; it says so at most every `TELL_S`
+        seconds, and the stage that follows once all is done."""
+        following = list(self._shares)[list(self._shares).index(stage) + 1]
+
+        def report(done: float, whole: float) -> None:
+            if math.isclose(done, whole):
+                self.begin(following)
+            elif time.monotonic() >= self._told + TELL_S:
+                self._say(stage, done / whole)
+
+        return report
+
+    def end(self) -> None:
+        """Say that all is done, with no stage."""
+        self._held.about.pop("phase", None)
+        self._held.keep(**{self._name: 1.0})
+
+    def _say(self, stage: str, part: float) -> None:
+        """Say that so much of a stage is done."""
+        self._told = time.monotonic()
+        before = itertools.takewhile(lambda name: name != stage, self._shares)
+        done = sum(self._shares[name] for name in before) + part * self._shares[stage]
+        self._held.keep(phase=stage, **{self._name: done / sum(self._shares.values())})
 
 
 def _named(correction: NamedCorrection | None) -> str:
@@ -375,27 +428,32 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
             "only the finished volume of a past scan is compared with its truth", {}
         )
     voxel_mm = float(np.max(grid.voxel_mm))
-    held.say(comparing=0.0)
-    truth = held.volumes.setdefault("truth", truth_of(data, grid))
-    held.volumes["difference"] = held.volumes["volume"] - truth
-    rows = {_named(data.correction): figures(held.volumes["volume"], truth, voxel_mm)}
     if data.correction is not None:
         other = NOMINAL
     elif now is None:
         other = None
     else:
         other = now.parameters
+    stages = dict(list(COMPARING.items())[: None if other is not None else 2])
+    work = Stages(held, "comparing", stages)
+    work.begin("computing the truth")
+    truth = held.volumes.setdefault("truth", truth_of(data, grid))
+    held.volumes["difference"] = held.volumes["volume"] - truth
+    work.begin("measuring the volume")
+    rows = {_named(data.correction): figures(held.volumes["volume"], truth, voxel_mm)}
     if other is not None:
+        work.begin("reconstructing with the other geometry")
         same = replace(
             request, voxel_mm=voxel_mm, shape=grid.shape, center_mm=grid.center_mm
         )
-        progress = _share(held, "comparing")
+        progress = work.reading("reconstructing with the other geometry")
         made = reconstruct_volume(data, same, parameters=other, progress=progress)
         held.volumes["other"] = made.data
         rows[_named(None if data.correction is not None else now)] = figures(
             made.data, truth, voxel_mm
         )
-    held.keep(comparing=1.0, compared=rows, volumes=list(held.volumes))
+    held.about |= {"compared": rows, "volumes": list(held.volumes)}
+    work.end()
 
 
 def _wait(path: Path, alive: Callable[[], bool]) -> None:

@@ -3,6 +3,7 @@
 import type {
   CalibrationFitResult,
   CheckStep,
+  DatasetInfo,
   DatasetListResult,
   DatasetResult,
   Estimated,
@@ -121,6 +122,12 @@ export interface Figures {
   z_mm: Pair;
   rms: number;
 }
+export interface LogEntry {
+  level: string;
+  message: string;
+  data?: { about?: string };
+}
+
 export interface VolumeMessage {
   name: string;
   side: number;
@@ -185,7 +192,7 @@ export interface Messages {
   layers: { shown: Record<string, boolean>; opacity: number };
   job: { data: JobStatus };
   note: { level: string; title: string; body: string };
-  log: { data: { level: string; message: string } };
+  log: { data: LogEntry };
   beat: { at: number; silent_s: number };
   // Where a handle is dragged to: why that cannot be reached, or how long it takes (twin's clock).
   drag: { targets: Record<string, number>; why: string | null; duration_s: number | null };
@@ -261,7 +268,10 @@ export interface Answers extends WireAnswers {
   "viewer.block": Partial<BlockHead & Offer>;
   "viewer.voxel": Record<string, number | null>;
   "viewer.compose": { text: string; moved: Record<string, Pair> };
-  "viewer.datasets": DatasetListResult;
+  "viewer.datasets": Omit<DatasetListResult, "datasets"> & {
+    // None of `beads` is known of samples that do not ship.
+    datasets: Array<DatasetInfo & { beads: boolean | null }>;
+  };
   "viewer.scrub": { positions: Record<string, number> | null };
   "viewer.screenshot": Offer;
   "viewer.export": Offer;
@@ -269,7 +279,9 @@ export interface Answers extends WireAnswers {
 
 // What the parts of the page tell each other: event -> what comes with it.
 export interface Events {
-  note: [level: string, title: string, body?: string];
+  // A note replaces one about the same subject, and goes when that is settled.
+  note: [level: string, title: string, body?: string, about?: string];
+  settled: [about: string];
   connection: [];
   open: [];
   session: [];
@@ -283,7 +295,7 @@ export interface Events {
   scan: [fresh: boolean];
   volume: [volume: VolumeMessage];
   image: [image?: Shown | null];
-  log: [entry: { level: string; message: string }];
+  log: [entry: LogEntry];
   tab: [name: string];
   drag: [told: Messages["drag"]];
   said: [];

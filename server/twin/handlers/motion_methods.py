@@ -211,7 +211,7 @@ async def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     twin.detours.cancel()
     twin.interrupt("E-stop")
     stopping = twin.scanner.estop(twin.clock.now(), client.name)
-    twin.tell("warning", f"E-stop by {client.name}")
+    twin.tell("warning", f"E-stop by {client.name}", about="estop")
     twin.changed()
     stopped = state_views.stopped_view(twin.state(), stopping, twin.clock.now())
     await twin.journal.durable(DURABLE_S)

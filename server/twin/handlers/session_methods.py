@@ -81,7 +81,8 @@ def control(twin: TwinServer, client: Client, params: p.Control) -> p.ControlRes
         case "force":
             loser = twin.control.force(client.name)
             if loser is not None:
-                twin.tell("warning", f"{client.name} took control from {loser}")
+                told = f"{client.name} took control from {loser}"
+                twin.tell("warning", told, about="control")
         case _:
             assert_never(params.action)
     twin.feed.changed()
