@@ -20,13 +20,13 @@ BLOCKS = dict(
 )
 TASKS = [name for name in BLOCKS if name != "Geometry as a value"]
 MADE = {
-    "An STL file to counts": ["part-scan/geometry.json", "part-scan/scan_000035.tif"],
-    "An array and ASTRA's vectors to FDK, SIRT and TV": [
+    "STL file to counts": ["part-scan/geometry.json", "part-scan/scan_000035.tif"],
+    "Array and ASTRA vectors to FDK, SIRT and TV": [
         "fdk.nrrd",
         "sirt.nrrd",
         "tv.nrrd",
     ],
-    "A folder to calibrated slices": [],
+    "Folder to calibrated slices": [],
     "A scan script with its timeline": ["timeline.png"],
     "A hundred misalignments for training": ["training.npz"],
     "Geometry as a value": ["moved.json"],
@@ -77,7 +77,7 @@ def test_the_block_runs(name: str, there: Path) -> None:
     exec(compile(BLOCKS[name], name, "exec"), space)
     for file in MADE[name]:
         assert (there / file).stat().st_size > 0
-    if name == "A folder to calibrated slices":
+    if name == "Folder to calibrated slices":
         beads = fx.phantoms.lego().beads
         found = space["data"].with_correction(space["found"].correction).geometry  # type: ignore[attr-defined]
         miss = [
