@@ -101,6 +101,19 @@ def test_frames_that_are_all_dark_leave_no_others() -> None:
     assert said.endswith("6 of 6 frames are dark")
 
 
+def test_scans_without_beads_are_to_be_aligned() -> None:
+    few = fx.ConeVec.circular(sod=600, sdd=1059, angles=6, shape=(95, 120), pixel=1.2)
+    rng = np.random.default_rng(1)
+    counts = rng.poisson(30_000, (6, 95, 120)).astype(np.uint16)
+    flat = np.full((95, 120), 30_000, dtype=np.uint16)
+    air = fx.DataSet.from_arrays(counts, few, flat=flat)
+    document: Any = air.calibrate("lego").document
+    assert document["problems"][0]["code"] == "no_beads"
+    assert document["next"][0].startswith("flexdt align DATASET  #")
+    for line in document["next"]:
+        known(line)
+
+
 @pytest.mark.parametrize("code", sorted(NEXT))
 def test_proposed_commands_exist(code: FindingCode) -> None:
     finding = error(code, "another phantom")

@@ -496,7 +496,8 @@ def find_phantom(phantom: str | Phantom) -> Phantom:
             target = read_phantom_file(Path(phantom))
     if len(target.beads) == 0:
         raise TwinError(
-            f"phantom {target.name!r} has no beads to calibrate with",
+            f"phantom {target.name!r} has no beads to calibrate with; `flexdt align`, or "
+            "`data.align()`, finds the axis of its scan without any",
             {"asked": target.name},
         )
     return target

@@ -79,6 +79,12 @@ class Typed:
         notes = "; ".join(f"{w}: {STANDS_FOR[w]}" for w in STANDS_FOR if w in words)
         return f"flexdt calibrate {shlex.join(words)}{notes and f'  # {notes}'}"
 
+    def without_beads(self) -> Iterator[str]:
+        """Yield the command for each scan that finds its axis without a phantom."""
+        for number, scan in enumerate(self.data):
+            own = ["--geometry", self.geometry[number]] if self.geometry else []
+            yield f"flexdt align {shlex.join([scan, *own])}  # where no phantom is in the scan"
+
     def use(self) -> str:
         """Return the command that reconstructs with the report: the scan itself if its
         markers were unknown, as they are the sample's own, else a place for the sample's.
@@ -170,6 +176,8 @@ def settling_commands(
         yield first
         yield typed.command(phantom=other)
         return
+    if finding.code is CalibrationCode.NO_BEADS:
+        yield from typed.without_beads()
     options = typed.options or {}
     if finding.code is CalibrationCode.AMBIGUOUS:
         yield from angle_commands(finding, typed)

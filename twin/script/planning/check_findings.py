@@ -24,9 +24,14 @@ def cut_off(sides: Mapping[str, float]) -> str:
     """Describe how far the sample is cut off; "" if it is not.
 
     `sides`: left, right, top, bottom -> pixels."""
-    return ", ".join(
-        f"{s} by {px:.0f} {CUT_AT_SIDE[s]}" for s, px in sides.items() if px > MIN_CUT_PX
-    )
+    found = []
+    for side, px in sides.items():
+        if px > MIN_CUT_PX:
+            count, unit = f"{px:.0f}", CUT_AT_SIDE[side]
+            found.append(
+                f"{side} by {count} {unit.removesuffix('s' if count == '1' else '')}"
+            )
+    return ", ".join(found)
 
 
 @dataclass(frozen=True)
