@@ -149,7 +149,9 @@ def test_no_difference_is_said(page: Any, wait: Wait) -> None:
 
 def test_a_confirmed_stop_is_not_called_unconfirmed(page: Any, wait: Wait) -> None:
     emitted(
-        page, ("note", "error", "E-stop not confirmed", "no answer for 5 s"), then="0"
+        page,
+        ("note", "error", "E-stop not confirmed", "no answer for 5 s", "safety.estop"),
+        then="0",
     )
     assert page.locator("#notes .note", has_text="E-stop not confirmed").count() == 1
     page.evaluate("flexdt.call('safety.estop').then(() => null)")

@@ -290,7 +290,8 @@ const former = () =>
  * @param {string} name
  * @returns {string}
  */
-export const doer = (name) => (former().includes(name) ? "you" : name.replace(/ #\d+$/, ""));
+export const doer = (name) =>
+  isMe(name) || former().includes(name) ? "you" : name.replace(/ #\d+$/, "");
 
 /** @param {string} name */
 function remember(name) {
