@@ -133,7 +133,8 @@ class Faulty:
 
     Attributes:
         spots: of each frame (m, 3): column, row, radius [px]; None where the frame is missing.
-        truth: of each parameter, the least and the largest value it had [mm, deg].
+        truth: of each parameter, the least and the largest value it had [mm, deg]; of roll and
+            tilt also with the turn of `turned_by_travel`.
         names: patterns of which each must be found in what is said.
         beside: patterns of what may be said, too.
         silent: to be offered and right without a word is right.
@@ -207,6 +208,17 @@ def in_images(world: World) -> dict[str, float]:
     along = math.cos(turn) * (ends[0] - ends[1]) + math.sin(turn) * (ends[2] - ends[3])
     return {"axis_column": float(column), "magnification": float(np.linalg.norm(along))
             * world.pixel / (2 * reach)}  # fmt: skip
+
+
+def turned_by_travel(world: World) -> float:
+    """Compute the turn about the beam of another scanner, whose stage rises straight and which
+    shows what this one does, whose stage goes aside as it rises in a helix [deg].
+    """
+    rise = world.pitch / 360.0 * world.angles
+    aside = np.broadcast_to(world.offsets.get("dO_x", 0.0), rise.shape)
+    if not world.pitch or not np.ptp(aside):
+        return 0.0
+    return -math.degrees(math.atan(np.polyfit(rise, aside, 1)[0]))
 
 
 def shadows(world: World) -> tuple[Array, Array]:
@@ -427,6 +439,10 @@ def taken(draft: Draft, rng: Rng) -> Faulty:
             "angle_scale": scale, **draft.world.offsets, **draft.truth,
         }.items()
     }  # fmt: skip
+    if turned := turned_by_travel(draft.world):
+        for name in ("det_roll", "axis_tilt_z"):
+            low, high = truth.get(name, (0.0, 0.0))
+            truth[name] = low + min(turned, 0.0), high + max(turned, 0.0)
     return Faulty(
         spots,
         draft.believed,

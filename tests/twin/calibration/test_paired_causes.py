@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from causes_named import calibrated, scored, worst_error
-from faults_drawn import right_draft, taken
+from faults_drawn import right_draft, shadows, taken, turned_by_travel
 from faults_paired import MILD, PAIRS, SETUPS, drawn_names, drawn_together, together
 
 
@@ -32,6 +32,32 @@ def test_pairs_share_no_quantity() -> None:
     assert not together("exposed_long", "exposed_as_said")
     assert together("grows", "frame_lost")
     assert {k for pair in PAIRS for k in pair.split("+")} == set(MILD)
+
+
+@pytest.mark.parametrize("slope", [-0.02, 0.006])
+def test_a_stage_that_goes_aside_as_it_rises_is_a_turned_scanner(slope: float) -> None:
+    """No image of a helix tells them apart: up is where the stage goes, and roll and tilt are
+    relative to it."""
+    rng = np.random.default_rng(60)
+    world = SETUPS["helix"](right_draft(rng), rng).world
+    offsets = {name: world.offsets[name] for name in ("tau_x", "tau_z")}
+    rise = world.pitch / 360.0 * world.angles
+    # The source is near the origin, about which all of it turns.
+    slanted = replace(
+        world, spot=0.0 * world.spot, offsets={**offsets, "dO_x": slope * rise}
+    )
+    turn = np.radians(turned_by_travel(slanted))
+    foot = offsets["tau_x"] * np.array([np.cos(turn), -np.sin(turn)])
+    straight = replace(
+        slanted,
+        pitch=world.pitch / np.cos(turn),
+        offsets={
+            **offsets, "dO_x": foot[0] - offsets["tau_x"], "dO_y": foot[1],
+            "det_roll": np.degrees(turn), "axis_tilt_z": np.degrees(turn),
+        },
+    )  # fmt: skip
+    assert abs(np.degrees(turn)) > 0.3
+    assert np.abs(shadows(slanted)[0] - shadows(straight)[0]).max() < 1e-6
 
 
 @pytest.mark.parametrize(
