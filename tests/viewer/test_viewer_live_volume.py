@@ -267,6 +267,8 @@ def test_nobody_waits_for_a_scan_that_nobody_looks_at(
         grow(held(lambda document: None), scan[0], SIDE, alive=lambda: False)
 
 
+@pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_the_volume_of_a_past_scan_is_that_of_the_command(
     scan: tuple[Path, list[Path]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
