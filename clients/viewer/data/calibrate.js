@@ -213,11 +213,13 @@ async function datasets() {
       ),
     );
   }
+  weigh();
 }
 /** Whether calibrating is the thing to do: not where the ticked samples are known without beads. */
 function weigh() {
-  const beadless = ticked().filter((name) => withoutBeads.has(name));
-  $("#fit").classList.toggle("primary", !beadless.length);
+  const names = ticked();
+  const beadless = names.filter((name) => withoutBeads.has(name));
+  $("#fit").classList.toggle("primary", names.length > 0 && !beadless.length);
   const words = "has no beads to calibrate by: Align, in the Data tab, finds its axis without";
   if ($button("#fit").disabled) return;
   $("#fit-note").textContent = beadless.length ? `${beadless.join(", ")} ${words}` : "";
